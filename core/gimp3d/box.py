@@ -1,0 +1,133 @@
+"""The region of interest: oriented boxes in scene coordinates; several boxes are a union."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import BadInput
+from .gaussians import matrices_to_quats, quats_to_matrices
+
+
+@dataclass(frozen=True)
+class Box:
+    """An oriented box: points `center + R(rotation) · x` with `|x| ≤ size / 2`."""
+
+    center: np.ndarray  # [3] float64, scene coordinates
+    size: np.ndarray  # [3] full edge lengths, > 0
+    rotation_wxyz: np.ndarray  # [4] unit quaternion
+
+    @classmethod
+    def make(cls, center: object, size: object, rotation_wxyz: object = (1, 0, 0, 0)) -> Box:
+        """A checked box from anything array-like.
+
+        Raises
+        ------
+        BadInput
+            If a number is missing, not finite, a size is not positive or the quaternion is zero.
+        """
+        try:
+            c, s, q = (np.array(v, dtype=np.float64) for v in (center, size, rotation_wxyz))
+        except (TypeError, ValueError) as error:
+            raise BadInput(f"ROI: numbers expected for center, size and rotation_wxyz ({error})") from None
+        for name, value, length in (("center", c, 3), ("size", s, 3), ("rotation_wxyz", q, 4)):
+            if value.shape != (length,) or not np.isfinite(value).all():
+                raise BadInput(f"ROI: {name} must be {length} finite numbers")
+        if (s <= 0).any():
+            raise BadInput(f"ROI: size must be positive, got {s.tolist()}")
+        norm = np.linalg.norm(q)
+        if norm < 1e-9:
+            raise BadInput("ROI: rotation_wxyz is zero; use [1, 0, 0, 0] for no rotation")
+        return cls(c, s, q / norm)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """[3, 3], columns are the box's axes in the scene."""
+        return quats_to_matrices(self.rotation_wxyz[None])[0]
+
+    def contains(
+        self,
+        points: np.ndarray,  # [N, 3]
+    ) -> np.ndarray:
+        """[N] bool; points on a face are inside, NaN is outside."""
+        local = (points - self.center) @ self.axes
+        return (np.abs(local) <= self.size / 2).all(-1)
+
+    def corners(self) -> np.ndarray:
+        """[8, 3]; corner k has the sign of bit b of k along axis b."""
+        signs = np.array([[1 if k >> b & 1 else -1 for b in range(3)] for k in range(8)])
+        return self.center + (signs * self.size / 2) @ self.axes.T
+
+    def to_json(self) -> dict[str, list[float]]:
+        return {
+            "center": self.center.tolist(),
+            "size": self.size.tolist(),
+            "rotation_wxyz": self.rotation_wxyz.tolist(),
+        }
+
+
+Region = tuple[Box, ...]
+
+
+def in_region(
+    region: Sequence[Box],
+    points: np.ndarray,  # [N, 3]
+) -> np.ndarray:
+    """[N] bool: inside any of the boxes."""
+    inside = np.zeros(len(points), dtype=bool)
+    for box in region:
+        inside |= box.contains(points)
+    return inside
+
+
+def box_from_matrix(
+    matrix: np.ndarray,  # [4, 4] unit-cube-to-scene transform without shear
+    bounds_min: np.ndarray,  # [3] of the shape in its own axes
+    bounds_max: np.ndarray,  # [3]
+) -> Box:
+    """The box that a transform makes of axis-aligned bounds; any rotation, scale (also negative), translation.
+
+    Raises
+    ------
+    BadInput
+        If the transform shears (rotated child of a non-uniformly scaled parent) or flattens the box.
+    """
+    linear = matrix[:3, :3]
+    lengths = np.linalg.norm(linear, axis=0)
+    if (lengths < 1e-12).any():
+        raise BadInput("ROI: the box is flat; give it a volume")
+    axes = linear / lengths
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-4:
+        raise BadInput("ROI: the box is sheared; apply its parent's scale first")
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1  # a mirrored box is the same set of points
+    center = (matrix @ np.append((bounds_min + bounds_max) / 2, 1.0))[:3]
+    return Box.make(center, lengths * (bounds_max - bounds_min), matrices_to_quats(axes[None])[0])
+
+
+def read_region(path: Path | str) -> Region:
+    """Read a ROI JSON: one box, or a list of boxes (CONTRACT: ROI).
+
+    Raises
+    ------
+    BadInput
+        If the file is missing, is not JSON, or a box is malformed.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInput(f"ROI: cannot read {path} ({error.strerror})") from None
+    except ValueError as error:
+        raise BadInput(f"ROI: {path} is not JSON ({error})") from None
+    boxes = data if isinstance(data, list) else [data]
+    if not boxes:
+        raise BadInput(f"ROI: {path} holds no box")
+    for box in boxes:
+        if not isinstance(box, dict) or not {"center", "size"} <= set(box):
+            raise BadInput(f'ROI: {path} must hold {{"center", "size", "rotation_wxyz"}} or a list of such boxes')
+    return tuple(Box.make(b["center"], b["size"], b.get("rotation_wxyz", (1, 0, 0, 0))) for b in boxes)

@@ -1,0 +1,25 @@
+"""Errors that end as one clear line. Each names the exit code of the command line (CONTRACT: exit codes)."""
+
+
+class Gimp3dError(Exception):
+    """Base of every error that a user can act on; the message says what, where, and what to do."""
+
+    exit_code = 1
+
+
+class BadInput(Gimp3dError):
+    """A file, option or value cannot be used as given."""
+
+    exit_code = 2
+
+
+class IllPosed(Gimp3dError):
+    """The input is legal but the task has no defined answer (METHOD section 8)."""
+
+    exit_code = 3
+
+
+class Cancelled(Gimp3dError):
+    """The caller asked to stop."""
+
+    exit_code = 130

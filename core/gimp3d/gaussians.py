@@ -1,0 +1,132 @@
+"""The scene: a set of 3D (or 2D, surfel) Gaussians, as 3DGS files store them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+SH_C0 = 0.28209479177387814  # Y_0; 3DGS stores colour as 0.5 + SH_C0 * f_dc, gamma-encoded sRGB
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians in the file's own frame and the file's own (raw) parametrisation.
+
+    Values are raw: log-scales, opacity logits and unnormalised quaternions, because untouched rows must survive
+    exactly. Use the properties for activated values.
+    """
+
+    means: np.ndarray  # [N, 3] float32, scene units
+    log_scales: np.ndarray  # [N, 3] float32, natural log; [N, 2] for 2DGS surfels (the normal is the third axis)
+    quats: np.ndarray  # [N, 4] float32, wxyz, not necessarily unit
+    opacity_logits: np.ndarray  # [N] float32, ±inf is legal
+    sh: np.ndarray  # [N, (degree+1)², 3] float32, coefficient k as (R, G, B)
+    antialiased: bool = False  # trained with the mip-splatting opacity compensation
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        shapes = {
+            "means": (self.means.shape, (n, 3)),
+            "log_scales": (self.log_scales.shape, (n, self.log_scales.shape[-1])),
+            "quats": (self.quats.shape, (n, 4)),
+            "opacity_logits": (self.opacity_logits.shape, (n,)),
+            "sh": (self.sh.shape, (n, self.sh.shape[1], 3)),
+        }
+        for name, (given, expected) in shapes.items():
+            if given != expected:
+                raise ValueError(f"{name}: expected shape {expected}, got {given}")
+        if self.log_scales.shape[1] not in (2, 3) or self.sh.shape[1] not in (1, 4, 9, 16):
+            raise ValueError(f"not a Gaussian set: {self.log_scales.shape[1]} scales, {self.sh.shape[1]} SH bands")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def is_surfels(self) -> bool:
+        """True for 2DGS (two scales)."""
+        return self.log_scales.shape[1] == 2
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Standard deviations along the local axes, [N, 3 or 2]."""
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_scales)
+
+    @property
+    def opacity(self) -> np.ndarray:
+        """Opacity in [0, 1], [N]."""
+        with np.errstate(over="ignore"):
+            return 1.0 / (1.0 + np.exp(-self.opacity_logits))
+
+    @property
+    def usable(self) -> np.ndarray:
+        """[N] bool: rows that can be drawn. NaN, infinite positions and zero quaternions are ignored in use."""
+        finite = np.isfinite(self.means).all(1) & np.isfinite(self.quats).all(1) & np.isfinite(self.sh).all((1, 2))
+        scales = ~np.isnan(self.log_scales).any(1) & (self.log_scales < 80).all(1)
+        return finite & scales & ~np.isnan(self.opacity_logits) & ((self.quats**2).sum(1) > 1e-20)
+
+    def take(self, rows: np.ndarray) -> Gaussians:
+        """The Gaussians at `rows` (indices or a boolean mask), in that order."""
+        return replace(
+            self,
+            means=self.means[rows],
+            log_scales=self.log_scales[rows],
+            quats=self.quats[rows],
+            opacity_logits=self.opacity_logits[rows],
+            sh=self.sh[rows],
+        )
+
+    def extended(self, other: Gaussians) -> Gaussians:
+        """These Gaussians followed by `other` of the same kind; the lower SH degree is padded with zeros."""
+        if self.is_surfels != other.is_surfels:
+            raise ValueError("cannot join 3D Gaussians and surfels")
+        bands = max(self.sh.shape[1], other.sh.shape[1])
+        return replace(
+            self,
+            means=np.concatenate([self.means, other.means]),
+            log_scales=np.concatenate([self.log_scales, other.log_scales]),
+            quats=np.concatenate([self.quats, other.quats]),
+            opacity_logits=np.concatenate([self.opacity_logits, other.opacity_logits]),
+            sh=np.concatenate([pad_sh(self.sh, bands), pad_sh(other.sh, bands)]),
+        )
+
+
+def pad_sh(
+    sh: np.ndarray,  # [N, K, 3]
+    bands: int,
+) -> np.ndarray:
+    """SH coefficients padded with zeros, or cut, to `bands` coefficients, [N, bands, 3]."""
+    if sh.shape[1] >= bands:
+        return sh[:, :bands]
+    return np.concatenate([sh, np.zeros((len(sh), bands - sh.shape[1], 3), sh.dtype)], axis=1)
+
+
+def quats_to_matrices(
+    quats: np.ndarray,  # [N, 4] wxyz, any norm > 0
+) -> np.ndarray:
+    """Rotation matrices [N, 3, 3] whose columns are the local axes."""
+    w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
+
+
+def matrices_to_quats(
+    matrices: np.ndarray,  # [N, 3, 3] proper rotations
+) -> np.ndarray:
+    """Unit quaternions [N, 4] wxyz with w ≥ 0."""
+    from scipy.spatial.transform import Rotation  # not needed where splats are only read and drawn
+
+    if len(matrices) == 0:
+        return np.zeros((0, 4))
+    xyzw = Rotation.from_matrix(matrices).as_quat()
+    wxyz = np.roll(xyzw, 1, axis=-1)
+    return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)

@@ -1,0 +1,1 @@
+"""Reading and writing files: the border where file conventions become ours."""

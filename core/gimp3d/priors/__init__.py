@@ -1,0 +1,1 @@
+"""Providers of what no view shows: appearance and relative depth."""
