@@ -122,11 +122,15 @@ def quats_to_matrices(
 def matrices_to_quats(
     matrices: np.ndarray,  # [N, 3, 3] proper rotations
 ) -> np.ndarray:
-    """Unit quaternions [N, 4] wxyz with w ≥ 0."""
-    from scipy.spatial.transform import Rotation  # not needed where splats are only read and drawn
-
-    if len(matrices) == 0:
-        return np.zeros((0, 4))
-    xyzw = Rotation.from_matrix(matrices).as_quat()
-    wxyz = np.roll(xyzw, 1, axis=-1)
+    """Unit quaternions [N, 4] wxyz with w ≥ 0 (Bar-Itzhack 2000: the dominant eigenvector of a 4×4 matrix)."""
+    m = np.asarray(matrices, dtype=np.float64)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(m, 0, -1)
+    rows = [
+        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+    ]
+    _, vectors = np.linalg.eigh(np.stack([np.stack(r, axis=-1) for r in rows], axis=-2))
+    wxyz = vectors[..., -1]
     return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
