@@ -1,0 +1,5 @@
+"""python -m gimp3d"""
+
+from .cli import entry_point
+
+entry_point()

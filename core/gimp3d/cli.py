@@ -1,0 +1,328 @@
+"""The command line (CONTRACT: gimp3d). Thin: reads files, calls the library, writes files, reports."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+from . import __version__
+from .errors import BadInput, Cancelled, Gimp3dError
+from .job import RemovalJob, load_job, save_job
+
+Namespace = argparse.Namespace
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(f"{message}; see {self.prog} --help")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Every command and option of the contract."""
+    parser = _Parser(prog="gimp3d", description="Remove an object from a Gaussian splat scene and fill the hole.")
+    parser.add_argument("--version", action="version", version=f"gimp3d {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+
+    info = commands.add_parser("info", help="say what a scene file holds")
+    info.add_argument("scene")
+    info.add_argument("--json", action="store_true", help="as JSON")
+
+    convert = commands.add_parser("convert", help="write a scene as an Inria-style PLY")
+    convert.add_argument("input", metavar="IN")
+    convert.add_argument("output", metavar="OUT")
+
+    draw = commands.add_parser("render", help="draw a scene from its cameras")
+    _scene_and_cameras(draw)
+    draw.add_argument("--out", required=True, metavar="DIR")
+    draw.add_argument("--split", choices=("train", "test", "all"), default="all")
+    draw.add_argument("--frames", metavar="ID,ID", help="only these cameras")
+    draw.add_argument("--passes", default="rgb", metavar="rgb,alpha,depth,normal")
+    draw.add_argument("--scale", type=float, default=1.0, help="resolution factor")
+    draw.add_argument("--background", default="0,0,0", metavar="R,G,B", help="0–1 each")
+    _running(draw)
+
+    masks = commands.add_parser("masks", help="write the region to fill in every view")
+    _scene_and_cameras(masks)
+    masks.add_argument("--roi", required=True)
+    masks.add_argument("--out", required=True, metavar="DIR")
+    masks.add_argument("--mode", choices=("need", "paper"), default="need")
+    masks.add_argument("--split", choices=("train", "test", "all"), default="train")
+    masks.add_argument("--frames", metavar="ID,ID", help="only these cameras are written")
+    _running(masks)
+
+    remove = commands.add_parser("remove", help="remove what lies in the region and fill the hole")
+    remove.add_argument("scene", nargs="?")
+    remove.add_argument("--cameras")
+    remove.add_argument("--roi")
+    remove.add_argument("--out", metavar="OUT.ply")
+    remove.add_argument("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
+    remove.add_argument("--reference", metavar="ID", help="the view to complete first (default: chosen)")
+    remove.add_argument("--reference-image", metavar="FILE", help="that view without the object")
+    remove.add_argument(
+        "--inpaint", default="exemplar", metavar="PROVIDER", help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD"
+    )
+    remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH")
+    remove.add_argument("--preset", choices=("draft", "balanced", "best", "paper", "paper-literal"), default="balanced")
+    remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
+    remove.add_argument("--views-out", metavar="DIR", help="write every completed view")
+    remove.add_argument("--report", metavar="DIR", help="write an HTML report with stage pictures")
+    remove.add_argument("--summary", metavar="FILE.json")
+    remove.add_argument("--job", metavar="DIR", help="keep every stage here; alone: run the job prepared there")
+    remove.add_argument("--resume", action="store_true", help="go on from the finished stages in --job")
+    remove.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    remove.add_argument("--seed", type=int, default=0)
+    _running(remove)
+
+    orbit = commands.add_parser("orbit", help="make cameras round a region")
+    orbit.add_argument("scene")
+    orbit.add_argument("--roi", required=True)
+    orbit.add_argument("--out", required=True, metavar="CAMS.json")
+    orbit.add_argument("--views", type=int, default=24)
+    orbit.add_argument("--up", default="0,0,1", metavar="X,Y,Z")
+    orbit.add_argument("--size", default="960x540", metavar="WxH")
+    orbit.add_argument("--fov", type=float, default=50.0, metavar="DEG", help="horizontal")
+
+    evaluate = commands.add_parser("evaluate", help="score pictures against true ones")
+    evaluate.add_argument("--pred", required=True, metavar="DIR")
+    evaluate.add_argument("--truth", required=True, metavar="DIR")
+    evaluate.add_argument("--masks", required=True, metavar="DIR")
+    evaluate.add_argument("--mask-suffix", default=".mask.png")
+    evaluate.add_argument("--exclude", default="", metavar="ID,ID")
+    evaluate.add_argument("--json", metavar="FILE")
+    return parser
+
+
+def _scene_and_cameras(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene")
+    parser.add_argument("--cameras", required=True, help="transforms.json, COLMAP folder, or cameras.json")
+
+
+def _running(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--threads", type=int, metavar="N", help="default: one per core")
+    parser.add_argument("--progress", choices=("bar", "json", "none"), default="bar")
+    parser.add_argument("--quiet", action="store_true", help="no progress, no summary text")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code (CONTRACT: 0, 2, 3, 130)."""
+    shown = Reporter("none")
+    try:
+        given = build_parser().parse_args(arguments)
+        shown = Reporter("none" if getattr(given, "quiet", False) else getattr(given, "progress", "none"))
+        COMMANDS[given.command](given, shown)
+        return 0
+    except Gimp3dError as error:
+        return _fail(shown, error.exit_code, str(error))
+    except KeyboardInterrupt:
+        return _fail(shown, Cancelled.exit_code, "interrupted; nothing was changed")
+    except MemoryError:
+        return _fail(shown, 3, "out of memory; use fewer or smaller views")
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone; there is nobody left to tell
+        return 0
+
+
+def _fail(shown: Reporter, code: int, message: str) -> int:
+    line = re.sub(r"\s+", " ", message)
+    shown.error(line)
+    print(f"gimp3d: error: {line}", file=sys.stderr)
+    return code
+
+
+class Reporter:
+    """Shows progress as a bar on stderr, as JSON lines on stdout, or not at all."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._width = 0
+
+    def __call__(self, stage: str, done: int, total: int, message: str = "") -> None:
+        if self.kind == "json":
+            print(
+                json.dumps({"stage": stage, "done": done, "total": total, "message": message}), flush=True
+            )
+        elif self.kind == "bar":
+            filled = 24 * done // max(1, total)
+            line = f"{stage:<14} [{'#' * filled}{'.' * (24 - filled)}] {done}/{total} {message}"[:110]
+            end = "\n" if done >= total else "\r"
+            sys.stderr.write(f"\r{line:<{self._width}}{end}")
+            sys.stderr.flush()
+            self._width = 0 if done >= total else len(line)
+
+    def done(self, summary: dict[str, Any]) -> None:
+        if self.kind == "json":
+            print(json.dumps({"stage": "done", "summary": summary}), flush=True)
+
+    def error(self, message: str) -> None:
+        if self.kind == "json":
+            print(json.dumps({"stage": "error", "message": message}), flush=True)
+
+
+def _info(given: Namespace, _: Reporter) -> None:
+    from .commands import scene_info
+
+    facts = scene_info(Path(given.scene))
+    if given.json:
+        print(json.dumps(facts, indent=1))
+    else:
+        for key, value in facts.items():
+            print(f"{key.replace('_', ' '):<22} {value}")
+
+
+def _convert(given: Namespace, _: Reporter) -> None:
+    from .commands import convert
+
+    convert(Path(given.input), Path(given.output))
+
+
+def _render(given: Namespace, shown: Reporter) -> None:
+    from .commands import render_views
+
+    render_views(
+        Path(given.scene),
+        Path(given.cameras),
+        Path(given.out),
+        split=given.split,
+        frames=_names(given.frames),
+        passes=tuple(_names(given.passes) or ()),
+        scale=given.scale,
+        background=_numbers(given.background, 3, "--background"),
+        threads=given.threads,
+        progress=shown,
+    )
+
+
+def _masks(given: Namespace, shown: Reporter) -> None:
+    from .commands import write_masks
+
+    write_masks(
+        Path(given.scene),
+        Path(given.cameras),
+        Path(given.roi),
+        Path(given.out),
+        mode=given.mode,
+        split=given.split,
+        frames=_names(given.frames),
+        threads=given.threads,
+        progress=shown,
+    )
+
+
+def _remove(given: Namespace, shown: Reporter) -> None:
+    from .commands import run_removal
+
+    folder = Path(given.job) if given.job else None
+    if folder and given.scene is None:
+        job = load_job(folder)
+        changes = {k: getattr(given, k) for k in ("summary", "report", "views_out", "threads") if getattr(given, k)}
+        job = replace(job, **changes)
+    else:
+        missing = [f"--{k}" for k in ("cameras", "roi", "out") if getattr(given, k) is None]
+        if given.scene is None:
+            missing.insert(0, "SCENE")
+        if missing:
+            raise BadInput(f"remove needs {', '.join(missing)} (or --job DIR alone, to run a prepared job)")
+        if given.resume and not folder:
+            raise BadInput("--resume needs --job DIR, the folder of the run to go on with")
+        values = {f: getattr(given, f) for f in RemovalJob.__dataclass_fields__ if f != "set"}
+        job = RemovalJob(**values, set=_settings(given.set))
+        if folder:
+            save_job(folder, job)
+    start = time.perf_counter()
+    summary = run_removal(job, folder, given.resume, shown)
+    shown.done(summary)
+    if not given.quiet and given.progress == "bar":
+        counts = summary["counts"]
+        print(
+            f"removed {counts['removed']} and added {counts['added']} Gaussians in "
+            f"{time.perf_counter() - start:.1f} s: {job.out}"
+        )
+    if given.progress != "json":
+        for warning in summary["warnings"]:
+            print(f"gimp3d: warning: {warning}", file=sys.stderr)
+
+
+def _orbit(given: Namespace, _: Reporter) -> None:
+    from .commands import write_orbit
+
+    size = re.fullmatch(r"(\d+)x(\d+)", given.size)
+    if not size:
+        raise BadInput(f"--size: WIDTHxHEIGHT expected, got {given.size!r}")
+    write_orbit(
+        Path(given.scene),
+        Path(given.roi),
+        Path(given.out),
+        views=given.views,
+        up=_numbers(given.up, 3, "--up"),
+        width=int(size[1]),
+        height=int(size[2]),
+        fov_degrees=given.fov,
+    )
+
+
+def _evaluate(given: Namespace, _: Reporter) -> None:
+    from .evaluate.metrics import evaluate_folders
+    from .job import write_atomically
+
+    scores = evaluate_folders(
+        Path(given.pred),
+        Path(given.truth),
+        Path(given.masks),
+        mask_suffix=given.mask_suffix,
+        exclude=tuple(_names(given.exclude) or ()),
+    )
+    if given.json:
+        write_atomically(Path(given.json), lambda f: f.write(json.dumps(scores, indent=1).encode()))
+    print(f"{'view':<20} {'PSNR dB':>8} {'SSIM':>7} {'FLIP':>7}")
+    for name, row in [*scores["views"].items(), ("mean", scores["mean"])]:
+        print(f"{name:<20} {row['psnr']:8.2f} {row['ssim']:7.3f} {row['flip']:7.3f}")
+
+
+COMMANDS = {
+    "info": _info,
+    "convert": _convert,
+    "render": _render,
+    "masks": _masks,
+    "remove": _remove,
+    "orbit": _orbit,
+    "evaluate": _evaluate,
+}
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    return tuple(n.strip() for n in text.split(",") if n.strip()) if text else None
+
+
+def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(v) for v in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(abs(v) < float("inf") for v in values):
+        raise BadInput(f"{option}: {count} numbers separated by commas expected, got {text!r}")
+    return values
+
+
+def _settings(pairs: Sequence[str]) -> dict[str, str]:
+    for pair in pairs:
+        if "=" not in pair:
+            raise BadInput(f"--set: key=value expected, got {pair!r}")
+    return dict(p.split("=", 1) for p in pairs)
+
+
+def entry_point() -> None:
+    """The `gimp3d` program: a terminated run ends like an interrupted one."""
+    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+    sys.exit(main())
+
+
+if __name__ == "__main__":
+    entry_point()

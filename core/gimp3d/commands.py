@@ -1,0 +1,366 @@
+"""What each command does with files: read, call the library, write. The same verbs are the Python interface."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import __version__
+from .box import read_region
+from .camera import Camera
+from .errors import BadInput, IllPosed
+from .io.cameras import read_cameras, write_transforms
+from .io.images import load_view, read_image, undistorted, write_png
+from .io.ply import SplatFile, read_ply, write_gaussians, write_ply
+from .jit import first_run
+from .job import RemovalJob, write_atomically
+from .orbit import orbit_cameras
+from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, remove_object, render_bytes
+from .progress import Progress, silent
+from .raster import RasterSettings, render
+from .stages.masks import MaskSettings, find_masks
+from .store import StageStore
+from .threads import parallel_map, set_thread_count
+
+PASSES = ("rgb", "alpha", "depth", "normal")
+
+
+def scene_info(path: Path) -> dict[str, Any]:
+    """Facts about a scene file: kind, count, SH degree, extent, unusable rows."""
+    file = read_ply(path)
+    g = file.gaussians
+    usable = g.usable
+    means = g.means[usable] if usable.any() else np.zeros((1, 3), np.float32)
+    return {
+        "file": str(path),
+        "kind": "2DGS" if g.is_surfels else "3DGS",
+        "gaussians": len(g),
+        "sh_degree": g.sh_degree,
+        "antialiased": g.antialiased,
+        "unusable_rows": int((~usable).sum()),
+        "bounds_min": np.percentile(means, 1, axis=0).round(4).tolist(),
+        "bounds_max": np.percentile(means, 99, axis=0).round(4).tolist(),
+        "format": file.table.format,
+        "properties": [p.name for p in file.table.properties],
+        "comments": list(file.table.comments),
+    }
+
+
+def convert(source: Path, target: Path) -> None:
+    """Write a scene as a plain binary PLY in Inria's layout."""
+    if target.suffix.lower() != ".ply":
+        raise BadInput(f"convert: {target} must end in .ply")
+    write_gaussians(target, read_ply(source).gaussians)
+
+
+def select_cameras(
+    cameras: Sequence[Camera], split: str = "all", frames: Sequence[str] | None = None
+) -> tuple[Camera, ...]:
+    """The cameras of a split, or those named (`frames` wins).
+
+    Raises
+    ------
+    BadInput
+        If a named camera does not exist or nothing is left.
+    """
+    if frames:
+        by_name = {c.id: c for c in cameras}
+        missing = [f for f in frames if f not in by_name]
+        if missing:
+            raise BadInput(f"no camera {', '.join(missing)}; the file has {', '.join(list(by_name)[:5])} …")
+        return tuple(by_name[f] for f in frames)
+    chosen = tuple(c for c in cameras if split in ("all", c.split))
+    if not chosen:
+        raise BadInput(f"the camera file has no frame of split {split!r}")
+    return chosen
+
+
+def render_views(
+    scene: Path,
+    cameras: Path,
+    out: Path,
+    split: str = "all",
+    frames: Sequence[str] | None = None,
+    passes: Sequence[str] = ("rgb",),
+    scale: float = 1.0,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Draw the scene from its cameras into `out` (CONTRACT: render)."""
+    _use_threads(threads)
+    unknown = [p for p in passes if p not in PASSES]
+    if unknown or not passes:
+        raise BadInput(f"render: unknown pass {', '.join(unknown) or '(none)'}; use {','.join(PASSES)}")
+    if not 0 < scale <= 16:
+        raise BadInput(f"render: --scale must be in (0, 16], got {scale}")
+    if not all(0 <= b <= 1 for b in background):
+        raise BadInput("render: --background takes three numbers from 0 to 1")
+    gaussians = read_ply(scene).gaussians
+    chosen = select_cameras(read_cameras(cameras), split, frames)
+    _announce_first_run(progress)
+    raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
+    for done, camera in enumerate(chosen, 1):
+        drawn = render(gaussians, undistorted(camera).scaled(scale), raster, frozenset(passes))
+        target = out / output_name(camera.id)
+        if "rgb" in passes:
+            write_png(target.with_name(target.name + ".png"), to_bytes(drawn.rgb))
+        if "alpha" in passes:
+            write_png(target.with_name(target.name + ".alpha.png"), to_bytes(drawn.alpha))
+        if "depth" in passes:
+            _write_npy(target.with_name(target.name + ".depth.npy"), drawn.median_depth)
+        if "normal" in passes:
+            _write_npy(target.with_name(target.name + ".normal.npy"), drawn.normals)
+        progress("render", done, len(chosen), camera.id)
+
+
+def write_masks(
+    scene: Path,
+    cameras: Path,
+    roi: Path,
+    out: Path,
+    mode: str = "need",
+    split: str = "train",
+    frames: Sequence[str] | None = None,
+    threads: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Write every view's target region as a 0/255 picture (CONTRACT: masks)."""
+    _use_threads(threads)
+    gaussians, region = read_ply(scene).gaussians, read_region(roi)
+    available = read_cameras(cameras)
+    written = [undistorted(c) for c in select_cameras(available, split, frames)]
+    names = {c.id for c in written}
+    others = [undistorted(c) for c in available if c.split == "train" and c.id not in names]
+    _announce_first_run(progress)
+    found = find_masks(gaussians, region, [*written, *others], MaskSettings(mode=mode), progress)
+    targets = {v.camera.id: v.target for v in found.views}
+    for camera in written:
+        empty = np.zeros((camera.height, camera.width), bool)
+        target = out / output_name(camera.id)
+        write_png(target.with_name(target.name + ".png"), targets.get(camera.id, empty))
+
+
+def write_orbit(
+    scene: Path,
+    roi: Path,
+    out: Path,
+    views: int = 24,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    width: int = 960,
+    height: int = 540,
+    fov_degrees: float = 50.0,
+) -> None:
+    """Write cameras round a region, for a scene that has none (CONTRACT: orbit)."""
+    read_ply(scene)  # a wrong file should be refused now, not when the cameras are used
+    cameras = orbit_cameras(read_region(roi), views, tuple(up), width, height, fov_degrees)  # type: ignore[arg-type]
+    write_transforms(out, cameras)
+
+
+def run_removal(
+    job: RemovalJob, folder: Path | None = None, resume: bool = False, progress: Progress = silent
+) -> dict[str, Any]:
+    """Run a removal from files to files; returns the summary (CONTRACT: remove, --summary)."""
+    start = time.perf_counter()
+    _use_threads(job.threads)
+    if job.device == "cuda":
+        raise BadInput("--device cuda: there is no CUDA backend yet; use cpu or auto")
+    settings = job_settings(job)
+    out = Path(job.out)
+    if out.suffix.lower() != ".ply":
+        raise BadInput(f"--out: {out} must end in .ply")
+    progress("read", 0, 1, job.scene)
+    file = read_ply(Path(job.scene))
+    region = read_region(Path(job.roi))
+    cameras = _removal_cameras(job)
+    warnings = list(_scene_warnings(file))
+    _announce_first_run(progress)
+    views, rendered = _load_views(cameras, job, file)
+    if rendered and job.images != "none":
+        warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
+    given = read_image(Path(job.reference_image)) if job.reference_image else None
+    progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
+    store = StageStore(folder / "stages", _job_key(job, views), STORED, resume) if folder else None
+    result = remove_object(
+        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store
+    )
+    write_ply(out, file, result.keep, result.added)
+    if job.views_out:
+        for name, image in result.painted.items():
+            target = Path(job.views_out) / output_name(name)
+            write_png(target.with_name(target.name + ".png"), image)
+    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
+    if job.report:
+        from .report import write_removal_report
+
+        write_removal_report(Path(job.report), file.gaussians, views, result, summary)
+    for path in filter(None, (job.summary, folder and folder / "summary.json")):
+        write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
+    return summary
+
+
+def job_settings(job: RemovalJob) -> RemovalSettings:
+    """The preset's settings with the job's own on top.
+
+    Raises
+    ------
+    BadInput
+        If a key of --set does not exist or its value is of the wrong type.
+    """
+    settings = replace(
+        PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed
+    )
+    for key, text in job.set.items():
+        settings = _with(settings, key.split("."), text, key)
+    return settings
+
+
+def _with(settings: Any, path: Sequence[str], text: str, key: str) -> Any:
+    names = [f.name for f in fields(settings)]
+    if path[0] not in names:
+        raise BadInput(f"--set: no setting {key!r}; {type(settings).__name__} has {', '.join(names)}")
+    value = getattr(settings, path[0])
+    if is_dataclass(value) and len(path) > 1:
+        return replace(settings, **{path[0]: _with(value, path[1:], text, key)})
+    if is_dataclass(value) or len(path) > 1:
+        raise BadInput(f"--set: {key!r} is not a single setting")
+    try:
+        new = _parse_like(value, text)
+    except ValueError:
+        raise BadInput(f"--set: {key} takes a {type(value).__name__}, got {text!r}") from None
+    return replace(settings, **{path[0]: new})
+
+
+def _parse_like(value: Any, text: str) -> Any:
+    if isinstance(value, bool):
+        if text.lower() not in ("true", "false", "0", "1"):
+            raise ValueError(text)
+        return text.lower() in ("true", "1")
+    if value is None:
+        return None if text == "none" else float(text)
+    return type(value)(text)
+
+
+def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
+    """The train frames and the reference, whatever its split."""
+    images = Path(job.images) if job.images and job.images != "none" else None
+    available = read_cameras(Path(job.cameras), images)
+    reference = _clean_id(job.reference)
+    if reference and reference not in {c.id for c in available}:
+        raise BadInput(f"--reference: no camera {reference}; the file has {available[0].id}, {available[-1].id} …")
+    if job.reference_image and not reference:
+        raise BadInput("--reference-image needs --reference ID, the camera that the picture was taken from")
+    chosen = tuple(c for c in available if c.split == "train" or c.id == reference)
+    if not any(c.split == "train" for c in chosen):
+        raise BadInput("the camera file has no train frame; remove needs at least one")
+    return chosen
+
+
+def _load_views(cameras: Sequence[Camera], job: RemovalJob, file: SplatFile) -> tuple[list[View], int]:
+    """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene."""
+
+    def load(camera: Camera) -> tuple[View, bool]:
+        wanted = job.images != "none" and camera.split == "train"
+        if wanted and camera.image is not None and camera.image.exists():
+            image, pinhole = load_view(camera)
+            return View(pinhole, image), False
+        pinhole = undistorted(camera)
+        return View(pinhole, render_bytes(file.gaussians, pinhole)), wanted
+
+    loaded = parallel_map(load, cameras)
+    return [v for v, _ in loaded], sum(missing for _, missing in loaded)
+
+
+def _scene_warnings(file: SplatFile) -> list[str]:
+    unusable = int((~file.gaussians.usable).sum())
+    found = []
+    if unusable:
+        found.append(f"{unusable} Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file")
+    if file.gaussians.is_surfels:
+        found.append("2DGS scene: surfels are drawn as flat Gaussians in this version")
+    return found
+
+
+def _summary(
+    job: RemovalJob,
+    settings: RemovalSettings,
+    file: SplatFile,
+    result: RemovalResult,
+    warnings: Sequence[str],
+    seconds: float,
+) -> dict[str, Any]:
+    removed, added = int((~result.keep).sum()), len(result.added) if result.added else 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 if sys.platform == "darwin" else 1024**-1 * 1024)
+    return {
+        "version": __version__,
+        "command": "remove",
+        "seconds_total": round(seconds, 3),
+        "stages": [asdict(s) for s in result.stages],
+        "counts": {
+            "gaussians_in": len(file.gaussians),
+            "removed": removed,
+            "added": added,
+            "gaussians_out": len(file.gaussians) - removed + added,
+            "views": result.views,
+            "hole_pixels": result.hole_pixels,
+        },
+        "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
+        "warnings": [*warnings, *result.warnings],
+        "peak_memory_mb": round(peak / 1024, 1),
+    }
+
+
+def _job_key(job: RemovalJob, views: Sequence[View]) -> str:
+    """A hash of everything that a stage's result depends on."""
+    digest = hashlib.sha256(__version__.encode())
+    free = ("out", "views_out", "report", "summary", "threads", "device")
+    files = ("scene", "cameras", "roi", "reference_image")
+    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, "images")}
+    digest.update(json.dumps(settings, sort_keys=True).encode())
+    for path in (getattr(job, f) for f in files):
+        if path and Path(path).is_file():
+            digest.update(Path(path).read_bytes())
+    for view in views:
+        digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
+        digest.update(np.ascontiguousarray(view.image))
+    return digest.hexdigest()
+
+
+def output_name(camera_id: str) -> str:
+    """A camera's ID without its extension, as a relative output path."""
+    head, _, tail = camera_id.rpartition("/")
+    stem = tail.rsplit(".", 1)[0] if "." in tail[1:] else tail
+    return f"{head}/{stem}" if head else stem
+
+
+def to_bytes(picture: np.ndarray) -> np.ndarray:
+    """[0, 1] floats as 8-bit values."""
+    return np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8)
+
+
+def _clean_id(name: str | None) -> str | None:
+    return name[2:] if name and name.startswith("./") else name
+
+
+def _write_npy(path: Path, array: np.ndarray) -> None:
+    write_atomically(path, lambda f: np.save(f, array.astype(np.float32)))
+
+
+def _use_threads(threads: int | None) -> None:
+    if threads is not None and threads < 1:
+        raise BadInput(f"--threads must be 1 or more, got {threads}")
+    set_thread_count(threads)
+
+
+def _announce_first_run(progress: Progress) -> None:
+    if first_run:
+        progress("compile", 0, 1, "first run on this machine: compiling kernels, some seconds")

@@ -1,0 +1,329 @@
+"""Gaussian PLY files (3DGS and 2DGS): read by property name, written back byte for byte (CONTRACT: SCENE, OUT.ply).
+
+Our own reader, because kept rows must keep their bytes in every format (a general PLY library re-formats ASCII and
+drops comments' places), and because it runs inside Blender, where only NumPy is at hand.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import BadInput
+from ..gaussians import Gaussians, pad_sh
+from ..job import write_atomically
+
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+MAX_HEADER = 1 << 20  # bytes; a longer header is not a PLY's
+ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip\b|\bantialiased\s+1\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """A scalar property of the vertex element."""
+
+    name: str
+    type: str  # as written in the header
+
+
+@dataclass(frozen=True)
+class PlyTable:
+    """A PLY file as it lies on disk: header lines and the vertex rows verbatim."""
+
+    header: tuple[str, ...]  # every line but `end_header`, without line ends
+    line_end: str
+    format: str  # ascii | binary_little_endian | binary_big_endian
+    properties: tuple[PlyProperty, ...]
+    rows: np.ndarray  # [N] void records of one row's bytes; ASCII: [N] object array of lines, as bytes
+    before: bytes = b""  # the body of elements in front of the vertices, verbatim
+    after: bytes = b""  # and behind them
+
+    @property
+    def comments(self) -> tuple[str, ...]:
+        return tuple(h.split(" ", 1)[1] for h in self.header if h.startswith("comment "))
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The record type of a row in the file's byte order."""
+        order = BYTE_ORDERS[self.format]
+        return np.dtype([(p.name, order + TYPES[p.type]) for p in self.properties])
+
+
+@dataclass(frozen=True)
+class SplatFile:
+    """A scene and the file it came from."""
+
+    gaussians: Gaussians
+    table: PlyTable
+
+
+def read_ply(path: Path | str) -> SplatFile:
+    """Read a Gaussian PLY.
+
+    Raises
+    ------
+    BadInput
+        If the file is missing, damaged, or not a Gaussian scene, saying which.
+    """
+    path = Path(path)
+    table = read_table(path)
+    return SplatFile(_gaussians(path, table), table)
+
+
+def write_ply(
+    path: Path | str,
+    file: SplatFile,
+    keep: np.ndarray,  # [N] bool
+    added: Gaussians | None = None,
+) -> None:
+    """Write the kept rows byte for byte in their order, then new ones in the same properties, format and types.
+
+    Properties that a Gaussian does not have (normals, extras) are 0 in new rows. Written atomically.
+
+    Raises
+    ------
+    BadInput
+        If the file cannot be written.
+    ValueError
+        If a new Gaussian is not finite.
+    """
+    table, count = file.table, int(np.count_nonzero(keep)) + (len(added) if added is not None else 0)
+    lines = [re.sub(r"^(element vertex) \d+$", rf"\1 {count}", " ".join(h.split())) if _counts(h) else h for h in table.header]
+    header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
+    kept = table.rows[np.asarray(keep, dtype=bool)]
+    new = new_rows(table, added) if added is not None and len(added) else None
+
+    def write(f):  # type: ignore[no-untyped-def]
+        f.write(header)
+        f.write(table.before)
+        if table.format == "ascii":
+            lines = [*kept, *(() if new is None else ascii_rows(new))]
+            f.write(b"".join(line + table.line_end.encode() for line in lines))
+        else:
+            f.write(np.ascontiguousarray(kept).tobytes())
+            if new is not None:
+                f.write(new.tobytes())
+        f.write(table.after)
+
+    write_atomically(Path(path), write)
+
+
+def write_gaussians(path: Path | str, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
+    """Write a fresh binary PLY in Inria's layout."""
+    bands = gaussians.sh.shape[1]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{k}" for k in range(3 * (bands - 1))] + ["opacity"]
+    names += [f"scale_{k}" for k in range(gaussians.log_scales.shape[1])] + [f"rot_{k}" for k in range(4)]
+    comments = [*comments, *(["antialiased 1"] if gaussians.antialiased else [])]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments), "element vertex 0"]
+    header += [f"property float {n}" for n in names]
+    properties = tuple(PlyProperty(n, "float") for n in names)
+    table = PlyTable(tuple(header), "\n", "binary_little_endian", properties, np.zeros(0, f"V{4 * len(names)}"))
+    write_ply(path, SplatFile(gaussians.take(np.zeros(0, int)), table), np.zeros(0, bool), gaussians)
+
+
+def read_table(path: Path) -> PlyTable:
+    """Read a PLY's header and vertex rows without interpreting them."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as f:
+            start = f.read(MAX_HEADER)
+    except OSError as error:
+        raise BadInput(f"cannot read {path} ({error.strerror})") from None
+    if not re.match(rb"ply\r?\n", start):
+        raise BadInput(f"{path} is not a PLY file (it does not begin with 'ply')")
+    end = re.search(rb"^end_header[ \t]*\r?\n", start, re.MULTILINE)
+    if not end:
+        raise BadInput(f"{path}: the PLY header has no end_header; the file is damaged")
+    line_end = "\r\n" if start[3:4] == b"\r" else "\n"
+    header = [line.rstrip("\r") for line in start[: end.start()].decode("latin-1").split("\n")[:-1]]
+    form, elements = _parse_header(path, header)
+    names = [e.name for e in elements]
+    if "chunk" in names or any(p.name.startswith("packed_") for e in elements for p in e.properties):
+        raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it to a plain PLY first")
+    if names.count("vertex") != 1:
+        raise BadInput(f"{path}: a PLY with one vertex element expected, found {names.count('vertex')}")
+    vertex = elements[names.index("vertex")]
+    if any(p.type == "list" for p in vertex.properties):
+        raise BadInput(f"{path}: the vertex element has a list property; that is not a Gaussian scene")
+    seen = [p.name for p in vertex.properties]
+    twice = sorted({n for n in seen if seen.count(n) > 1})
+    if twice:
+        raise BadInput(f"{path}: property {', '.join(twice)} occurs twice in the vertex element")
+    if vertex.count and not any(n.startswith("f_dc_") for n in seen):
+        what = "it has plain colours (red, green, blue)" if "red" in seen else "a mesh or a point cloud"
+        raise BadInput(f"{path} is not a Gaussian scene: no property f_dc_0, {what}")
+    read = _read_ascii if form == "ascii" else _read_binary
+    before, rows, after = read(path, elements, names.index("vertex"), end.end(), size, form)
+    return PlyTable(tuple(header), line_end, form, vertex.properties, rows, before, after)
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[PlyProperty, ...]
+
+    @property
+    def row_bytes(self) -> int | None:
+        """None if a list makes rows of different sizes."""
+        if any(p.type == "list" for p in self.properties):
+            return None
+        return sum(np.dtype(TYPES[p.type]).itemsize for p in self.properties)
+
+
+def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[_Element]]:
+    form, elements = "", []
+    for line in lines[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and words[1] in BYTE_ORDERS:
+            form = words[1]
+        elif words[0] == "element" and len(words) == 3 and re.fullmatch(r"\d{1,18}", words[2]):
+            elements.append(_Element(words[1], int(words[2]), ()))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in TYPES:
+            elements[-1] = _with_property(elements[-1], PlyProperty(words[2], words[1]))
+        elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":
+            elements[-1] = _with_property(elements[-1], PlyProperty(words[4], "list"))
+        else:
+            raise BadInput(f"{path}: the PLY header line {line[:60]!r} makes no sense; the file is damaged")
+    if not form:
+        raise BadInput(f"{path}: the PLY header names no format")
+    return form, elements
+
+
+def _with_property(element: _Element, new: PlyProperty) -> _Element:
+    return _Element(element.name, element.count, (*element.properties, new))
+
+
+def _read_binary(
+    path: Path, elements: Sequence[_Element], vertex: int, start: int, size: int, form: str
+) -> tuple[bytes, np.ndarray, bytes]:
+    first = start
+    for element in elements[:vertex]:
+        if element.row_bytes is None:
+            raise BadInput(f"{path}: element {element.name} with lists in front of the vertices is not supported")
+        first += element.count * element.row_bytes
+    row_bytes, count = elements[vertex].row_bytes or 0, elements[vertex].count
+    if first + count * row_bytes > size:
+        raise BadInput(
+            f"{path} is truncated: {count} rows of {row_bytes} bytes announced, {max(0, size - first)} bytes there"
+        )
+    with path.open("rb") as f:
+        f.seek(start)
+        before = f.read(first - start)
+        rows = np.fromfile(f, dtype=f"V{row_bytes}", count=count) if row_bytes else np.zeros(0, "V1")
+        after = f.read()
+    if after and vertex == len(elements) - 1:
+        after = b""  # bytes that no element announces
+    return before, rows, after
+
+
+def _read_ascii(
+    path: Path, elements: Sequence[_Element], vertex: int, start: int, size: int, form: str
+) -> tuple[bytes, np.ndarray, bytes]:
+    lines = path.read_bytes()[start:].splitlines(keepends=True)
+    first = sum(e.count for e in elements[:vertex])
+    count = elements[vertex].count
+    rows = [line.rstrip(b"\r\n") for line in lines[first : first + count]]
+    if len(rows) < count:
+        raise BadInput(f"{path} is truncated: {count} rows announced, {len(rows)} there")
+    table = np.empty(count, object)
+    table[:] = rows
+    return b"".join(lines[:first]), table, b"".join(lines[first + count :])
+
+
+def values(table: PlyTable, path: Path | str = "PLY") -> np.ndarray:
+    """The rows as records in the machine's byte order, [N] structured."""
+    if table.format != "ascii":
+        records = np.ascontiguousarray(table.rows).view(table.dtype) if len(table.rows) else np.zeros(0, table.dtype)
+        return records.astype(table.dtype.newbyteorder("="), copy=False)
+    width = len(table.properties)
+    records = np.zeros(len(table.rows), table.dtype)
+    if len(table.rows) == 0:
+        return records
+    try:
+        cells = np.array(b" ".join(table.rows).split(), dtype=np.float64)
+    except ValueError:
+        raise BadInput(f"{path}: a row holds something that is not a number") from None
+    if cells.size != width * len(table.rows):
+        raise BadInput(f"{path}: rows of {width} numbers expected; the file is damaged")
+    with np.errstate(invalid="ignore", over="ignore"):
+        for k, p in enumerate(table.properties):
+            records[p.name] = cells[k::width]
+    return records
+
+
+def _gaussians(path: Path, table: PlyTable) -> Gaussians:
+    names = [p.name for p in table.properties]
+    records = values(table, path)
+
+    def columns(wanted: Sequence[str]) -> np.ndarray:
+        missing = [n for n in wanted if n not in names]
+        if missing:
+            raise BadInput(f"{path} is not a Gaussian scene: no property {', '.join(missing)}")
+        out = np.empty((len(records), len(wanted)), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, n in enumerate(wanted):
+                out[:, k] = records[n]
+        return out
+
+    scale_count = sum(bool(re.fullmatch(r"scale_\d+", n)) for n in names)
+    if scale_count not in (2, 3):
+        raise BadInput(f"{path}: scale_0..2 (3DGS) or scale_0..1 (2DGS) expected, found {scale_count} scales")
+    rest = sum(bool(re.fullmatch(r"f_rest_\d+", n)) for n in names)
+    if rest not in (0, 9, 24, 45):
+        raise BadInput(f"{path}: {rest} f_rest properties; 0, 9, 24 or 45 expected (SH degree 0–3)")
+    dc = columns([f"f_dc_{k}" for k in range(3)])
+    higher = columns([f"f_rest_{k}" for k in range(rest)]).reshape(len(records), 3, rest // 3)  # channel-major
+    return Gaussians(
+        means=columns(["x", "y", "z"]),
+        log_scales=columns([f"scale_{k}" for k in range(scale_count)]),
+        quats=columns([f"rot_{k}" for k in range(4)]),
+        opacity_logits=columns(["opacity"])[:, 0],
+        sh=np.concatenate([dc[:, None], higher.transpose(0, 2, 1)], axis=1),
+        antialiased=any(ANTIALIASED.search(c) for c in table.comments),
+    )
+
+
+def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
+    """Records for new Gaussians in the table's properties, [M] structured in the file's byte order."""
+    rest = sum(bool(re.fullmatch(r"f_rest_\d+", p.name)) for p in table.properties)
+    sh = pad_sh(added.sh, rest // 3 + 1)
+    fields = {n: added.means[:, k] for k, n in enumerate("xyz")}
+    fields |= {f"f_dc_{k}": sh[:, 0, k] for k in range(3)}
+    fields |= {f"f_rest_{k}": sh[:, 1 + k % (rest // 3), k // (rest // 3)] for k in range(rest)}
+    fields |= {"opacity": added.opacity_logits}
+    fields |= {f"scale_{k}": added.log_scales[:, k] for k in range(added.log_scales.shape[1])}
+    fields |= {f"rot_{k}": added.quats[:, k] for k in range(4)}
+    records = np.zeros(len(added), table.dtype)
+    for p in table.properties:
+        if p.name in fields:
+            if not np.isfinite(fields[p.name]).all():
+                raise ValueError(f"a new Gaussian has a {p.name} that is not finite")
+            records[p.name] = fields[p.name]
+    return records
+
+
+def ascii_rows(records: np.ndarray) -> list[bytes]:
+    """Records as text lines, each number the shortest that reads back to the same value."""
+    columns = [[_text(v) for v in records[n]] for n in records.dtype.names or ()]
+    return [" ".join(cells).encode() for cells in zip(*columns)]
+
+
+def _text(value: np.generic) -> str:
+    return np.format_float_positional(value, trim="-") if isinstance(value, np.floating) else str(value)
+
+
+def _counts(line: str) -> bool:
+    return line.split()[:2] == ["element", "vertex"]

@@ -1,0 +1,363 @@
+"""The stages in order: a scene, its views and a region in; the scene without the object out (DESIGN: how it flows)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from .box import Region
+from .camera import Camera
+from .errors import BadInput, IllPosed
+from .gaussians import Gaussians
+from .priors.inpaint import inpaint_reference
+from .priors.monodepth import depth_prior
+from .progress import Progress, silent
+from .raster import RasterSettings, footprint, render
+from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
+from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
+from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
+from .stages.propagate import (
+    PaintedView,
+    Propagation,
+    PropagateSettings,
+    Reference,
+    Rule,
+    ViewToPaint,
+    propagate,
+)
+from .stages.reference import ReferenceChoice, ReferenceSettings, choose_reference, disparity_of, rim
+from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .threads import parallel_map
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class RemovalSettings:
+    """Every stage's settings, and the providers of what no view shows."""
+
+    masks: MaskSettings = MaskSettings()
+    reference: ReferenceSettings = ReferenceSettings()
+    depth: DepthSettings = DepthSettings()
+    mapping: MappingSettings = MappingSettings()
+    propagate: PropagateSettings = PropagateSettings()
+    seed: SeedSettings = SeedSettings()
+    inpaint: str = "exemplar"
+    depth_prior: str = "auto"
+    extra_references: int = 2  # views completed after the first one, where it does not reach
+    extra_gain: float = 0.02  # share of the hole that an extra reference must still find open
+    random_seed: int = 0
+
+
+PRESETS: dict[str, RemovalSettings] = {
+    "draft": RemovalSettings(extra_references=0),
+    "balanced": RemovalSettings(),
+    "best": RemovalSettings(extra_references=4, extra_gain=0.005),
+    "paper": RemovalSettings(
+        masks=MaskSettings(mode="paper"),
+        depth=DepthSettings(scale_factor=0.1),
+        propagate=PropagateSettings(transfer="sample"),
+        extra_references=0,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What a stage says of itself."""
+
+    name: str
+    seconds: float
+    confidence: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A stage's result to look at; kinds are drawn by evaluate.report."""
+
+    stage: str
+    camera_id: str
+    data: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class RemovalResult:
+    """The removal: which rows stay, what is added, and how it came about."""
+
+    keep: np.ndarray  # [N] bool over the input's rows
+    added: Gaussians | None
+    stages: tuple[StageReport, ...] = ()
+    hole_pixels: int = 0
+    views: int = 0
+    painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
+    pictures: tuple[Picture, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+class Store(Protocol):
+    """Where finished stages are kept, so that a stopped run can go on (job.StageStore)."""
+
+    def load(self, name: str) -> Any | None: ...
+
+    def save(self, name: str, result: Any) -> None: ...
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and what it sees, the object included."""
+
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] uint8
+
+
+class _Run:
+    """Runs stages one after the other: times them, keeps their words, and takes finished ones from the store."""
+
+    def __init__(self, store: Store | None, progress: Progress) -> None:
+        self.store, self.progress = store, progress
+        self.stages: list[StageReport] = []
+        self.warnings: list[str] = []
+        self.pictures: list[Picture] = []
+
+    def __call__(self, name: str, work: Callable[[], R], words: Callable[[R], tuple[float, str]] | None = None) -> R:
+        self.progress(name, 0, 1)
+        start = time.perf_counter()
+        result = self.store.load(name) if self.store else None
+        if result is None:
+            result = work()
+            if self.store:
+                self.store.save(name, result)
+        confidence, reason = words(result) if words else (result.confidence, result.reason)  # type: ignore[attr-defined]
+        self.stages.append(StageReport(name, time.perf_counter() - start, float(confidence), reason))
+        self.progress(name, 1, 1, reason)
+        return result
+
+
+def remove_object(
+    scene: Gaussians,
+    views: Sequence[View],
+    region: Region,
+    settings: RemovalSettings = RemovalSettings(),  # noqa: B008
+    reference: str | None = None,
+    reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
+    progress: Progress = silent,
+    store: Store | None = None,
+) -> RemovalResult:
+    """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
+
+    Parameters
+    ----------
+    views
+        Training views and, if it is another one, the reference view. Their images show the scene with the object.
+    reference
+        ID of the reference view; None chooses one.
+    reference_image
+        What the reference view looks like without the object; None fills it by `settings.inpaint`.
+
+    Raises
+    ------
+    IllPosed
+        If the task has no defined answer, with the reason.
+    """
+    run = _Run(store, progress)
+    masks = run(
+        "masks",
+        lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress),
+    )
+    keep = ~masks.removed
+    if not masks.removed.any():
+        return _finish(run, keep, None, masks, {}, ["nothing to remove: the region holds no Gaussian"])
+    if masks.left_out:
+        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    if masks.hole_pixels == 0:
+        return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
+    kept, images = scene.take(keep), {v.camera.id: v.image for v in views}
+    filled, added = kept, None
+    painted: dict[str, np.ndarray] = {}
+    open_views = masks.views
+    for round_ in range(1 + settings.extra_references):
+        suffix = "" if round_ == 0 else f" {round_ + 1}"
+        if round_ and _open_share(open_views, masks) < settings.extra_gain:
+            break
+        try:
+            new, painting = _fill_from_one_view(
+                run,
+                suffix,
+                filled,
+                scene,
+                masks,
+                open_views,
+                {**images, **painted},
+                settings,
+                reference if round_ == 0 else None,
+                reference_image if round_ == 0 else None,
+            )
+        except IllPosed as error:
+            if round_ == 0:
+                raise
+            run.warnings.append(f"no further reference view helps ({error})")
+            break
+        if len(new) == 0:
+            break
+        added = new if added is None else added.extended(new)
+        filled = kept.extended(added)
+        painted.update({p.camera_id: p.image for p in painting.views})
+        open_views = tuple(parallel_map(lambda v, f=filled, a=added: _still_open(v, f, len(a)), masks.views))
+    left = _open_share(open_views, masks)
+    if left > settings.extra_gain:
+        run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
+    return _finish(run, keep, added, masks, painted, [])
+
+
+def _fill_from_one_view(
+    run: _Run,
+    suffix: str,
+    filled: Gaussians,  # the scene so far, without the object
+    scene: Gaussians,  # as given
+    masks: Masks,
+    open_views: Sequence[ViewMasks],
+    images: dict[str, np.ndarray],
+    settings: RemovalSettings,
+    wanted: str | None,
+    given: np.ndarray | None,
+) -> tuple[Gaussians, Propagation]:
+    """Complete one reference, carry it into every view, and make its Gaussians."""
+    solid = settings.masks.solid
+    choice: ReferenceChoice = run(
+        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference)
+    )
+    view = next(v for v in open_views if v.camera.id == choice.camera_id)
+    completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
+    depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
+    emptied = render_bytes(filled, view.camera)
+    before = images[view.camera.id]
+    appearance = run(
+        f"appearance{suffix}",
+        lambda: inpaint_reference(
+            settings.inpaint,
+            _outside_object(before, emptied, view),
+            view.target,
+            settings.random_seed,
+            given,
+        ),
+    )
+    seeds = seed_gaussians(
+        view.camera, appearance.image, depth, view.target, scene.is_surfels, settings.seed
+    )
+    if len(seeds) == 0:
+        raise IllPosed(f"reference {view.camera.id}: the surface behind the object is infinitely far; nothing to build")
+    with_seeds = filled.extended(seeds)
+    to_paint = parallel_map(
+        lambda v: ViewToPaint(
+            v.camera,
+            images[v.camera.id],
+            render_bytes(filled, v.camera),
+            v.silhouette,
+            v.target,
+            v.depth_before,
+            render(with_seeds, v.camera, RasterSettings(), frozenset({"depth"})).median_depth,
+        ),
+        open_views,
+    )
+    field_: MappingField = run(
+        f"mapping{suffix}",
+        lambda: mapping_field(
+            appearance.image,
+            view.target,
+            source_visibility(
+                depth,
+                view.camera,
+                [v.camera for v in open_views],
+                [v.depth_before for v in open_views],
+                [v.target for v in open_views],
+            ),
+            settings.mapping,
+        ),
+    )
+    completed_reference = Reference(view.camera, appearance.image, depth, view.target, field_.rows, field_.cols)
+    painting: Propagation = run(
+        f"propagate{suffix}",
+        lambda: propagate(completed_reference, to_paint, settings.propagate, run.progress),
+    )
+    new: Gaussians = run(
+        f"seed{suffix}",
+        lambda: colour_gaussians(
+            seeds, view.camera, to_paint, painting.views, scene.sh_degree, settings.seed
+        ),
+        lambda g: (1.0, f"{len(g)} new Gaussians"),
+    )
+    return new, painting
+
+
+def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
+    known = rim(view, settings.masks.solid)
+    disparity = disparity_of(view.depth_after)
+    prior = depth_prior(settings.depth_prior, view.camera, disparity, known, view.target, settings.depth)
+    return complete_disparity(disparity, known, view.target, prior, settings.depth)
+
+
+def _outside_object(image: np.ndarray, emptied: np.ndarray, view: ViewMasks) -> np.ndarray:
+    """The view without the object, its hole aside: the photo, and the emptied scene where the object was."""
+    return np.where((view.silhouette & ~view.target)[..., None], emptied, image)
+
+
+def _still_open(view: ViewMasks, filled: Gaussians, added: int) -> ViewMasks:
+    """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover."""
+    new = np.zeros(len(filled), bool)
+    new[-added:] = True
+    covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
+    after = render(filled, view.camera, RasterSettings(), frozenset({"depth", "alpha"}))
+    return replace(
+        view, target=view.target & ~covered, depth_after=after.median_depth, alpha_after=after.alpha
+    )
+
+
+def _open_share(open_views: Sequence[ViewMasks], masks: Masks) -> float:
+    return sum(int(v.target.sum()) for v in open_views) / max(1, masks.hole_pixels)
+
+
+def render_bytes(
+    gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)
+) -> np.ndarray:
+    """The scene as 8-bit RGB, [H, W, 3]."""
+    rgb = render(gaussians, camera, RasterSettings(background=background), frozenset({"rgb"})).rgb
+    return np.clip(np.rint(rgb * 255), 0, 255).astype(np.uint8)
+
+
+def _finish(
+    run: _Run,
+    keep: np.ndarray,
+    added: Gaussians | None,
+    masks: Masks,
+    painted: dict[str, np.ndarray],
+    warnings: list[str],
+) -> RemovalResult:
+    return RemovalResult(
+        keep=keep,
+        added=added,
+        stages=tuple(run.stages),
+        hole_pixels=masks.hole_pixels,
+        views=len(masks.views),
+        painted=painted,
+        pictures=tuple(run.pictures),
+        warnings=tuple(run.warnings + warnings),
+    )
+
+
+# What a stage store has to know to bring results back.
+STORED = (
+    Camera,
+    Gaussians,
+    Masks,
+    ViewMasks,
+    ReferenceChoice,
+    DepthCompletion,
+    MappingField,
+    Propagation,
+    PaintedView,
+)

@@ -1,0 +1,114 @@
+"""Which view explains the hole best, and what can be seen of the hole's surface in the photos (METHOD section 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..camera import Camera
+from ..errors import IllPosed
+from .depth import complete_disparity
+from .masks import ViewMasks
+
+
+@dataclass(frozen=True)
+class ReferenceSettings:
+    """What makes a reference acceptable."""
+
+    minimum_pixels: int = 1  # a view with fewer hole pixels cannot be the reference
+    truncation_power: float = 2.0  # how hard a hole cut by the frame is punished
+
+
+@dataclass(frozen=True)
+class ReferenceChoice:
+    """The chosen view and why; `scores` holds (camera ID, score) of every candidate, best first."""
+
+    camera_id: str
+    scores: tuple[tuple[str, float], ...]
+    confidence: float
+    reason: str
+
+
+def surface_normals(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z-depth, 0 = nothing
+) -> np.ndarray:
+    """Unit normals [H, W, 3] of a depth map in camera axes, facing the camera; 0 where depth is missing."""
+    points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)) @ camera.R.T
+    right, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normals = np.cross(down, right)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    valid = (depth > 0)[..., None] & (length > 0)
+    return np.where(valid, normals / np.where(length > 0, length, 1), 0.0)
+
+
+def facing(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W]
+) -> np.ndarray:
+    """cos θ between each surface element and its viewing ray, [H, W] in [0, 1]."""
+    rays = np.concatenate(
+        [(camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(depth.shape)[..., None]],
+        -1,
+    )
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return np.clip(-(surface_normals(camera, depth) * rays).sum(-1), 0.0, 1.0)
+
+
+def disparity_of(depth: np.ndarray) -> np.ndarray:
+    """1/z [H, W] float32, 0 where there is nothing (METHOD section 0)."""
+    return np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
+
+
+def rim(view: ViewMasks, solid: float) -> np.ndarray:
+    """[H, W] bool: pixels whose depth after the removal is trusted (METHOD section 3, boundary)."""
+    return ~view.target & (view.alpha_after > solid) & (view.depth_after > 0)
+
+
+def choose_reference(
+    views: Sequence[ViewMasks],
+    wanted: str | None = None,
+    solid: float = 0.9,
+    settings: ReferenceSettings = ReferenceSettings(),  # noqa: B008
+) -> ReferenceChoice:
+    """The view that shows most of the needed surface, square on and not cut off by the frame.
+
+    Score: the sum over the hole's pixels of cos θ to the provisionally completed surface, which is the surface
+    integral of visible × cos θ × pixels per area, times the framed share of the hole (METHOD section 2).
+
+    Raises
+    ------
+    IllPosed
+        If the wanted view does not see the hole, or no view does.
+    """
+    scores = sorted(((v.camera.id, _score(v, solid, settings)) for v in views), key=lambda s: (-s[1], s[0]))
+    usable = [s for s in scores if s[1] > 0]
+    if wanted is not None:
+        if wanted not in dict(usable):
+            raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
+        chosen = wanted
+    elif usable:
+        chosen = usable[0][0]
+    else:
+        raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
+    best, score = usable[0][1], dict(usable)[chosen]
+    how = "as asked" if wanted else "sees most of the hidden surface"
+    return ReferenceChoice(
+        chosen, tuple(scores), score / best, f"{chosen}: {how} (score {score:.0f}, best {best:.0f})"
+    )
+
+
+def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
+    if view.target.sum() < settings.minimum_pixels:
+        return 0.0
+    try:
+        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target, None)
+    except IllPosed:
+        return 0.0
+    cosine = facing(view.camera, np.where(view.target, completed.depth, view.depth_after))[view.target].sum()
+    h, w = view.target.shape
+    on_border = view.target[0].sum() + view.target[-1].sum() + view.target[:, 0].sum() + view.target[:, -1].sum()
+    framed = max(0.0, 1.0 - on_border / max(1.0, 2 * np.sqrt(view.target.sum())))
+    return float(cosine * framed**settings.truncation_power)
