@@ -1,0 +1,367 @@
+"""Camera files: nerfstudio transforms.json, COLMAP models, Inria's cameras.json. The one border of their conventions.
+
+Everything behind it is OpenCV: x right, y down, z forward, world→camera, pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera, Distortion
+from ..errors import BadInput
+from ..gaussians import quats_to_matrices
+from ..job import write_atomically
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
+REFUSED = {
+    "fisheye": ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "FISHEYE"),
+    "panoramic": ("EQUIRECTANGULAR", "SPHERICAL", "VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "PANORAMIC"),
+    "orthographic": ("ORTHOGRAPHIC", "ORTHOPHOTO"),
+}  # fmt: skip
+COLMAP_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
+COLMAP_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
+
+
+def read_cameras(
+    path: Path | str,
+    images: Path | None = None,  # folder of the photos; default: beside the camera file
+) -> tuple[Camera, ...]:
+    """Read cameras of any known kind, told apart by content (CONTRACT: CAMS).
+
+    Raises
+    ------
+    BadInput
+        If the file is missing, of another kind, empty, or a camera is of a kind that cannot be used.
+    """
+    path = Path(path)
+    if path.is_dir():
+        cameras = _read_colmap(path, images)
+    else:
+        document = _read_json(path)
+        if isinstance(document, dict) and isinstance(document.get("frames"), list):
+            cameras = _read_transforms(path, document, images)
+        elif isinstance(document, list) and document and isinstance(document[0], dict) and "rotation" in document[0]:
+            cameras = _read_inria(path, document, images)
+        else:
+            raise BadInput(f"{path} holds no cameras: a transforms.json, cameras.json or COLMAP folder expected")
+    if not cameras:
+        raise BadInput(f"{path} holds no camera")
+    names = [c.id for c in cameras]
+    if len(set(names)) < len(names):
+        twice = next(n for n in names if names.count(n) > 1)
+        raise BadInput(f"{path}: two cameras have the ID {twice}")
+    return cameras
+
+
+def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
+    """Write a nerfstudio transforms.json with exact intrinsics per frame. Written atomically."""
+    frames = []
+    for c in cameras:
+        d = c.distortion or Distortion()
+        frames.append(
+            {
+                "file_path": c.id,
+                "split": c.split,
+                "w": c.width,
+                "h": c.height,
+                "fl_x": c.fx,
+                "fl_y": c.fy,
+                "cx": c.cx,
+                "cy": c.cy,
+                "k1": d.k1,
+                "k2": d.k2,
+                "p1": d.p1,
+                "p2": d.p2,
+                "k3": d.k3,
+                "transform_matrix": (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist(),
+            }
+        )
+    document = {"camera_model": "OPENCV", "frames": frames}
+    write_atomically(Path(path), lambda f: f.write(json.dumps(document, indent=1).encode()))
+
+
+def camera_id(name: Any, where: str) -> str:
+    """A camera's name as a safe relative path: `./` dropped, `..` and absolute paths refused."""
+    if not isinstance(name, str) or not name.strip():
+        raise BadInput(f"{where}: a camera has no name")
+    parts = [p for p in name.replace("\\", "/").split("/") if p != "."]
+    if ".." in parts or name.startswith("/") or re.match(r"^[A-Za-z]:", name) or "\0" in name:
+        raise BadInput(f"{where}: the camera name {name!r} leads out of the output folder")
+    return "/".join(parts)
+
+
+def rigid(
+    matrix: Any,  # [4, 4] or [3, 4], camera→world or world→camera
+    where: str,
+) -> np.ndarray:
+    """A pose [4, 4] with its rotation orthonormal; a uniform scale is taken off.
+
+    Raises
+    ------
+    BadInput
+        If it is not a finite 4×4 matrix, or it mirrors, shears or flattens.
+    """
+    try:
+        m = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        m = np.zeros(0)
+    if m.shape == (3, 4):
+        m = np.vstack([m, [0, 0, 0, 1]])
+    if m.shape != (4, 4) or not np.isfinite(m).all():
+        raise BadInput(f"{where}: the pose is not a finite 4×4 matrix")
+    u, s, vt = np.linalg.svd(m[:3, :3])
+    if s[2] < 1e-9 or s[0] / s[2] > 1.001:
+        raise BadInput(f"{where}: the pose is sheared or flat; only rotation, translation and uniform scale are poses")
+    rotation = u @ vt
+    if np.linalg.det(rotation) < 0:
+        raise BadInput(f"{where}: the pose mirrors the scene")
+    return np.block([[rotation, m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def make_camera(
+    where: str,
+    name: Any,
+    viewmat: np.ndarray,
+    size: tuple[Any, Any],
+    intrinsics: tuple[Any, Any, Any, Any],  # fx, fy, cx, cy
+    distortion: Distortion | None = None,
+    split: str = "train",
+    image: Path | None = None,
+) -> Camera:
+    """A checked Camera.
+
+    Raises
+    ------
+    BadInput
+        If a size, focal length or principal point makes no sense.
+    """
+    try:
+        width, height = (int(v) for v in size)
+        fx, fy, cx, cy = (float(v) for v in intrinsics)
+    except (TypeError, ValueError, OverflowError):
+        raise BadInput(f"{where}: numbers expected for size, focal length and principal point") from None
+    if not 0 < width < 1 << 16 or not 0 < height < 1 << 16:
+        raise BadInput(f"{where}: an image of {width}×{height} pixels makes no sense")
+    if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
+        raise BadInput(f"{where}: focal lengths must be positive, got {fx} and {fy}")
+    if distortion is not None:
+        if not np.isfinite(distortion.coefficients).all():
+            raise BadInput(f"{where}: the distortion coefficients are not finite")
+        if not distortion.coefficients.any():
+            distortion = None
+    return Camera(camera_id(name, where), width, height, fx, fy, cx, cy, viewmat, split, image, distortion)
+
+
+def refuse_model(model: str, where: str) -> None:
+    """Raise BadInput if a camera model is one of those that have no pinhole picture."""
+    for kind, names in REFUSED.items():
+        if model.upper() in names:
+            raise BadInput(f"{where}: {kind} cameras ({model}) are not supported; undistort the photos to a pinhole")
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInput(f"cameras: cannot read {path} ({error.strerror})") from None
+    except ValueError as error:
+        raise BadInput(f"cameras: {path} is not JSON ({error})") from None
+
+
+def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) -> tuple[Camera, ...]:
+    cameras = []
+    for k, frame in enumerate(document["frames"]):
+        where = f"{path}, frame {k}"
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise BadInput(f"{where}: no transform_matrix")
+        both = {**{key: v for key, v in document.items() if key != "frames"}, **frame}
+        name = camera_id(frame.get("file_path"), where)
+        refuse_model(str(both.get("camera_model", "OPENCV")), where)
+        if both.get("is_fisheye"):
+            refuse_model("FISHEYE", where)
+        photo = _photo(images or path.parent, name)
+        width, height, intrinsics = _transforms_intrinsics(both, photo, where)
+        extra = [k for k in ("k4", "k5", "k6") if both.get(k)]
+        if extra:
+            raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
+        viewmat = np.linalg.inv(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV)
+        distortion = _distortion([both.get(c, 0.0) for c in ("k1", "k2", "p1", "p2", "k3")], where)
+        split = both.get("split", "train")
+        if split not in ("train", "test"):
+            raise BadInput(f"{where}: split must be train or test, got {split!r}")
+        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, split, photo))
+    return tuple(cameras)
+
+
+def _transforms_intrinsics(
+    both: dict[str, Any], photo: Path, where: str
+) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+    width, height = both.get("w"), both.get("h")
+    if width is None or height is None:
+        width, height = _image_size(photo, where)
+    fx = both.get("fl_x")
+    if fx is None and "camera_angle_x" in both:
+        fx = 0.5 * float(width) / math.tan(0.5 * float(both["camera_angle_x"]))
+    if fx is None:
+        raise BadInput(f"{where}: no focal length (fl_x or camera_angle_x)")
+    fy = both.get("fl_y", fx)
+    return width, height, (fx, fy, both.get("cx", float(width) / 2), both.get("cy", float(height) / 2))
+
+
+def _image_size(photo: Path, where: str) -> tuple[int, int]:
+    from .images import read_image  # needs OpenCV, which files that name their size do without
+
+    if not photo.exists():
+        raise BadInput(f"{where}: no image size (w, h) and no photo {photo} to take it from")
+    height, width = read_image(photo).shape[:2]
+    return width, height
+
+
+def _photo(folder: Path, name: str) -> Path:
+    path = folder / name
+    return path if path.suffix or path.exists() else path.with_name(path.name + ".png")
+
+
+def _distortion(coefficients: Sequence[Any], where: str) -> Distortion:
+    try:
+        return Distortion(*(float(c) for c in coefficients))
+    except (TypeError, ValueError):
+        raise BadInput(f"{where}: the distortion coefficients are not numbers") from None
+
+
+def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[Camera, ...]:
+    cameras = []
+    for k, entry in enumerate(document):
+        where = f"{path}, camera {k}"
+        missing = [n for n in ("img_name", "rotation", "position", "fx", "fy", "width", "height") if n not in entry]
+        if missing:
+            raise BadInput(f"{where}: no {', '.join(missing)}")
+        try:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = np.array(entry["rotation"], float), np.array(entry["position"], float)
+        except (TypeError, ValueError):
+            raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers") from None
+        name = camera_id(entry["img_name"], where)
+        size = (entry["width"], entry["height"])
+        viewmat = np.linalg.inv(rigid(pose, where))
+        try:
+            centre = (float(size[0]) / 2, float(size[1]) / 2)
+        except (TypeError, ValueError):
+            raise BadInput(f"{where}: width and height must be numbers") from None
+        intrinsics = (entry["fx"], entry["fy"], *centre)
+        photo = _photo(images or path.parent, name)
+        cameras.append(make_camera(where, name, viewmat, size, intrinsics, None, "train", photo))
+    return tuple(cameras)
+
+
+def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
+    model = next((m for m in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0") if _is_model(m)), None)
+    if model is None:
+        raise BadInput(f"{folder} holds no COLMAP model (cameras and images, .bin or .txt)")
+    binary = (model / "images.bin").exists()
+    try:
+        lenses = _colmap_cameras_bin(model) if binary else _colmap_cameras_txt(model)
+        poses = _colmap_images_bin(model) if binary else _colmap_images_txt(model)
+    except OSError as error:
+        raise BadInput(f"cannot read the COLMAP model in {model} ({error.strerror})") from None
+    except (struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError) as error:
+        raise BadInput(f"the COLMAP model in {model} is damaged ({error})") from None
+    if images is None:
+        images = next((f for f in (folder / "images", folder.parent / "images", folder.parent.parent / "images") if f.is_dir()), folder)
+    cameras = []
+    for name, lens, quat, translation in poses:
+        where = f"{model}, image {name}"
+        if lens not in lenses:
+            raise BadInput(f"{where}: its camera {lens} is not in the model")
+        kind, width, height, parameters = lenses[lens]
+        refuse_model(kind, where)
+        intrinsics, distortion = _colmap_intrinsics(kind, parameters, where)
+        if not np.isfinite([*quat, *translation]).all() or np.linalg.norm(quat) < 1e-9:
+            raise BadInput(f"{where}: the pose is not finite")
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = quats_to_matrices(np.array([quat]))[0], translation
+        photo = images / camera_id(name, where)
+        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, "train", photo))
+    return tuple(sorted(cameras, key=lambda c: c.id))
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"cameras{e}").exists() and (folder / f"images{e}").exists() for e in (".bin", ".txt"))
+
+
+def _colmap_intrinsics(
+    kind: str, p: Sequence[float], where: str
+) -> tuple[tuple[float, float, float, float], Distortion | None]:
+    layouts: dict[str, Callable[[], tuple[tuple[float, float, float, float], list[float]]]] = {
+        "SIMPLE_PINHOLE": lambda: ((p[0], p[0], p[1], p[2]), []),
+        "PINHOLE": lambda: ((p[0], p[1], p[2], p[3]), []),
+        "SIMPLE_RADIAL": lambda: ((p[0], p[0], p[1], p[2]), [p[3]]),
+        "RADIAL": lambda: ((p[0], p[0], p[1], p[2]), [p[3], p[4]]),
+        "OPENCV": lambda: ((p[0], p[1], p[2], p[3]), list(p[4:8])),
+        "FULL_OPENCV": lambda: ((p[0], p[1], p[2], p[3]), list(p[4:9])),
+    }
+    if kind not in layouts or (kind == "FULL_OPENCV" and any(p[9:12])):
+        raise BadInput(f"{where}: the camera model {kind} is not supported; undistort the photos to a pinhole")
+    try:
+        intrinsics, coefficients = layouts[kind]()
+    except IndexError:
+        raise BadInput(f"{where}: the camera model {kind} has too few parameters") from None
+    return intrinsics, _distortion(coefficients, where) if coefficients else None
+
+
+def _data_lines(path: Path) -> list[str]:
+    return [line.rstrip("\r") for line in path.read_text(encoding="utf-8").split("\n") if not line.startswith("#")]
+
+
+def _colmap_cameras_txt(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
+    rows = [line.split() for line in _data_lines(model / "cameras.txt") if line.strip()]
+    return {int(r[0]): (r[1], int(r[2]), int(r[3]), [float(v) for v in r[4:]]) for r in rows}
+
+
+def _colmap_images_txt(model: Path) -> list[tuple[str, int, list[float], list[float]]]:
+    poses = []
+    lines = iter(_data_lines(model / "images.txt"))
+    for line in lines:
+        if not line.strip():
+            continue
+        words = line.strip().split(" ", 9)  # the name comes last and may hold spaces
+        poses.append((words[9], int(words[8]), [float(v) for v in words[1:5]], [float(v) for v in words[5:8]]))
+        next(lines, None)  # the image's 2D points, possibly an empty line
+    return poses
+
+
+def _colmap_cameras_bin(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
+    data = (model / "cameras.bin").read_bytes()
+    (count,), at, found = struct.unpack_from("<Q", data), 8, {}
+    for _ in range(count):
+        number, kind, width, height = struct.unpack_from("<iiQQ", data, at)
+        if not 0 <= kind < len(COLMAP_MODELS):
+            raise ValueError(f"unknown camera model {kind}")
+        parameters = struct.unpack_from(f"<{COLMAP_PARAMETERS[kind]}d", data, at + 24)
+        at += 24 + 8 * COLMAP_PARAMETERS[kind]
+        found[number] = (COLMAP_MODELS[kind], width, height, list(parameters))
+    return found
+
+
+def _colmap_images_bin(model: Path) -> list[tuple[str, int, list[float], list[float]]]:
+    data = (model / "images.bin").read_bytes()
+    (count,), at, poses = struct.unpack_from("<Q", data), 8, []
+    for _ in range(count):
+        pose = struct.unpack_from("<7d", data, at + 4)
+        (lens,) = struct.unpack_from("<i", data, at + 60)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode("utf-8")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+        if at > len(data):
+            raise ValueError("images.bin is truncated")
+        poses.append((name, lens, list(pose[:4]), list(pose[4:])))
+    return poses

@@ -1,0 +1,103 @@
+"""Photos in and pictures out. 8-bit sRGB as it is; lens distortion ends here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from ..errors import BadInput
+from ..job import write_atomically
+
+ASPECT_TOLERANCE = 1.5  # px by which a photo's size may differ from the scaled camera's, from rounding
+
+
+def read_image(path: Path | str) -> np.ndarray:
+    """A picture as [H, W, 3] uint8 RGB; 16 bit is reduced, grey repeated, alpha composited on black.
+
+    Raises
+    ------
+    BadInput
+        If it is missing or not a picture.
+    """
+    picture = _read(Path(path))
+    if picture.dtype == np.uint16:
+        picture = (picture.astype(np.uint32) * 255 + 32767) // 65535
+    elif picture.dtype != np.uint8:
+        picture = np.clip(np.rint(np.nan_to_num(picture.astype(np.float32)) * 255), 0, 255)
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.shape[2] == 1:
+        picture = picture.repeat(3, axis=2)
+    elif picture.shape[2] == 2:
+        picture = picture[..., :1].repeat(3, axis=2)
+    elif picture.shape[2] == 4:
+        picture = picture[..., :3].astype(np.uint32) * picture[..., 3:] // 255
+    return np.ascontiguousarray(picture[..., 2::-1].astype(np.uint8))
+
+
+def read_mask(path: Path | str) -> np.ndarray:
+    """A mask as [H, W] bool: true where the picture is brighter than half."""
+    return read_image(path).max(-1) > 127
+
+
+def write_png(
+    path: Path | str,
+    picture: np.ndarray,  # [H, W, 3] uint8 RGB, [H, W] uint8 or bool (as 0/255)
+) -> None:
+    """Write a PNG atomically."""
+    if picture.dtype == bool:
+        picture = picture.astype(np.uint8) * 255
+    ok, data = cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)
+    if not ok:
+        raise BadInput(f"cannot encode {path} as PNG")
+    write_atomically(Path(path), lambda f: f.write(data.tobytes()))
+
+
+def undistorted(camera: Camera) -> Camera:
+    """The pinhole camera of the same K whose pictures `load_view` gives."""
+    return replace(camera, distortion=None)
+
+
+def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
+    """A camera's photo [H, W, 3] uint8, resampled to the camera's size and undistorted, and its pinhole camera.
+
+    Raises
+    ------
+    BadInput
+        If the photo is missing, unreadable or of another aspect ratio than the camera.
+    """
+    if camera.image is None:
+        raise BadInput(f"camera {camera.id} has no photo")
+    photo = read_image(camera.image)
+    height, width = photo.shape[:2]
+    factor = width / camera.width
+    if abs(height - factor * camera.height) > max(ASPECT_TOLERANCE, ASPECT_TOLERANCE * factor):
+        raise BadInput(
+            f"{camera.image} has {width}×{height} pixels, which does not fit its camera's {camera.width}×{camera.height}"
+        )
+    if (width, height) != (camera.width, camera.height):
+        way = cv2.INTER_AREA if factor > 1 else cv2.INTER_LINEAR
+        photo = cv2.resize(photo, (camera.width, camera.height), interpolation=way)
+    if camera.distortion is not None:
+        at_integers = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's pixel centres are whole numbers
+        photo = cv2.undistort(photo, at_integers, camera.distortion.coefficients)
+    return photo, undistorted(camera)
+
+
+def _read(path: Path) -> np.ndarray:
+    try:
+        data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII names on Windows
+    except OSError as error:
+        raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
+    flags = cv2.IMREAD_UNCHANGED
+    try:
+        picture = cv2.imdecode(data, flags) if len(data) else None
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise BadInput(f"{path} is not a picture that can be read")
+    return picture

@@ -1,0 +1,75 @@
+"""Cameras round a region, for a scene that comes without any."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from .box import Box
+from .camera import Camera
+from .errors import BadInput
+
+ELEVATIONS = (15.0, 35.0, 60.0)  # degrees above the floor; each ring's cameras stand between the last ring's
+FILL = 0.4  # share of the smaller image side that the region's bounding sphere takes
+
+
+def orbit_cameras(
+    region: Sequence[Box],
+    count: int = 24,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    width: int = 960,
+    height: int = 540,
+    fov_degrees: float = 50.0,  # horizontal
+) -> tuple[Camera, ...]:
+    """Cameras that look at a region's centre from rings above it, IDs orbit/000, orbit/001 …
+
+    Raises
+    ------
+    BadInput
+        If the up direction is zero, or a count, size or angle makes no sense.
+    """
+    axis = np.asarray(up, dtype=np.float64)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
+        raise BadInput("orbit: the up direction must be three numbers, not all zero")
+    if not 1 <= count <= 10_000:
+        raise BadInput(f"orbit: between 1 and 10000 views, got {count}")
+    if not 1 < fov_degrees < 170:
+        raise BadInput(f"orbit: the field of view must lie between 1 and 170 degrees, got {fov_degrees}")
+    if not (0 < width < 1 << 16 and 0 < height < 1 << 16):
+        raise BadInput(f"orbit: an image of {width}×{height} pixels makes no sense")
+    axis /= np.linalg.norm(axis)
+    corners = np.concatenate([box.corners() for box in region])
+    centre = (corners.min(0) + corners.max(0)) / 2
+    radius = float(np.linalg.norm(corners - centre, axis=1).max())
+    focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
+    distance = radius * 2 * focal / (FILL * min(width, height))
+    side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
+    side /= np.linalg.norm(side)
+    front = np.cross(axis, side)
+    cameras = []
+    for k in range(count):
+        elevation = math.radians(ELEVATIONS[k % len(ELEVATIONS)])
+        azimuth = 2 * math.pi * k / count
+        away = math.cos(elevation) * (math.cos(azimuth) * side + math.sin(azimuth) * front) + math.sin(elevation) * axis
+        viewmat = look_at(centre + distance * away, centre, axis)
+        cameras.append(
+            Camera(f"orbit/{k:03d}", width, height, focal, focal, width / 2, height / 2, viewmat, "train")
+        )
+    return tuple(cameras)
+
+
+def look_at(
+    eye: np.ndarray,  # [3]
+    target: np.ndarray,  # [3]
+    up: np.ndarray,  # [3], not along the view
+) -> np.ndarray:
+    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    return matrix
