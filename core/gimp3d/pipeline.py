@@ -11,9 +11,9 @@ import numpy as np
 
 from .box import Region
 from .camera import Camera
-from .errors import BadInput, IllPosed
+from .errors import IllPosed
 from .gaussians import Gaussians
-from .priors.inpaint import inpaint_reference
+from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render
@@ -25,11 +25,18 @@ from .stages.propagate import (
     Propagation,
     PropagateSettings,
     Reference,
-    Rule,
     ViewToPaint,
     propagate,
 )
-from .stages.reference import ReferenceChoice, ReferenceSettings, choose_reference, disparity_of, rim
+from .stages.reference import (
+    EvidenceSettings,
+    ReferenceChoice,
+    ReferenceSettings,
+    choose_reference,
+    disparity_of,
+    gather_evidence,
+    rim,
+)
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
 from .threads import parallel_map
 
@@ -42,12 +49,14 @@ class RemovalSettings:
 
     masks: MaskSettings = MaskSettings()
     reference: ReferenceSettings = ReferenceSettings()
+    evidence: EvidenceSettings = EvidenceSettings()
     depth: DepthSettings = DepthSettings()
     mapping: MappingSettings = MappingSettings()
     propagate: PropagateSettings = PropagateSettings()
     seed: SeedSettings = SeedSettings()
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
+    use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
     extra_references: int = 2  # views completed after the first one, where it does not reach
     extra_gain: float = 0.02  # share of the hole that an extra reference must still find open
     random_seed: int = 0
@@ -61,6 +70,7 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper"),
         depth=DepthSettings(scale_factor=0.1),
         propagate=PropagateSettings(transfer="sample"),
+        use_evidence=False,
         extra_references=0,
     ),
 }
@@ -161,14 +171,13 @@ def remove_object(
 
     Raises
     ------
+    BadInput
+        If a provider cannot be used.
     IllPosed
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
-    masks = run(
-        "masks",
-        lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress),
-    )
+    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress))
     keep = ~masks.removed
     if not masks.removed.any():
         return _finish(run, keep, None, masks, {}, ["nothing to remove: the region holds no Gaussian"])
@@ -176,38 +185,39 @@ def remove_object(
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
     if masks.hole_pixels == 0:
         return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
-    kept, images = scene.take(keep), {v.camera.id: v.image for v in views}
+    kept = scene.take(keep)
+    photos = {v.camera.id: v.image for v in views}
+    painted = {
+        v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
+        for v in masks.views
+    }
     filled, added = kept, None
-    painted: dict[str, np.ndarray] = {}
     open_views = masks.views
     for round_ in range(1 + settings.extra_references):
-        suffix = "" if round_ == 0 else f" {round_ + 1}"
         if round_ and _open_share(open_views, masks) < settings.extra_gain:
             break
+        first = round_ == 0
         try:
             new, painting = _fill_from_one_view(
                 run,
-                suffix,
+                "" if first else f" {round_ + 1}",
                 filled,
-                scene,
-                masks,
                 open_views,
-                {**images, **painted},
+                photos,
+                painted,
                 settings,
-                reference if round_ == 0 else None,
-                reference_image if round_ == 0 else None,
+                reference if first else None,
+                reference_image if first else None,
             )
         except IllPosed as error:
-            if round_ == 0:
+            if first:
                 raise
-            run.warnings.append(f"no further reference view helps ({error})")
-            break
-        if len(new) == 0:
+            run.warnings.append(f"no further reference view helps: {error}")
             break
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
         painted.update({p.camera_id: p.image for p in painting.views})
-        open_views = tuple(parallel_map(lambda v, f=filled, a=added: _still_open(v, f, len(a)), masks.views))
+        open_views = tuple(parallel_map(lambda v, f=filled, n=len(added): _still_open(v, f, n), masks.views))
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
         run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
@@ -218,10 +228,9 @@ def _fill_from_one_view(
     run: _Run,
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
-    scene: Gaussians,  # as given
-    masks: Masks,
     open_views: Sequence[ViewMasks],
-    images: dict[str, np.ndarray],
+    photos: dict[str, np.ndarray],  # with the object
+    painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
     wanted: str | None,
     given: np.ndarray | None,
@@ -234,29 +243,19 @@ def _fill_from_one_view(
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
     completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
-    emptied = render_bytes(filled, view.camera)
-    before = images[view.camera.id]
-    appearance = run(
+    appearance: Appearance = run(
         f"appearance{suffix}",
-        lambda: inpaint_reference(
-            settings.inpaint,
-            _outside_object(before, emptied, view),
-            view.target,
-            settings.random_seed,
-            given,
-        ),
+        lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
-    seeds = seed_gaussians(
-        view.camera, appearance.image, depth, view.target, scene.is_surfels, settings.seed
-    )
+    seeds = seed_gaussians(view.camera, appearance.image, depth, view.target, filled.is_surfels, settings.seed)
     if len(seeds) == 0:
-        raise IllPosed(f"reference {view.camera.id}: the surface behind the object is infinitely far; nothing to build")
+        raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)
     to_paint = parallel_map(
         lambda v: ViewToPaint(
             v.camera,
-            images[v.camera.id],
-            render_bytes(filled, v.camera),
+            photos[v.camera.id],
+            painted[v.camera.id],
             v.silhouette,
             v.target,
             v.depth_before,
@@ -264,46 +263,59 @@ def _fill_from_one_view(
         ),
         open_views,
     )
+    source = ~view.target & ~view.silhouette & (depth > 0)
     field_: MappingField = run(
         f"mapping{suffix}",
         lambda: mapping_field(
             appearance.image,
             view.target,
+            source,
             source_visibility(
-                depth,
-                view.camera,
-                [v.camera for v in open_views],
-                [v.depth_before for v in open_views],
-                [v.target for v in open_views],
+                view.camera, depth, [(v.camera, v.depth_before, v.silhouette) for v in open_views], settings.mapping
             ),
             settings.mapping,
+            settings.random_seed,
         ),
     )
-    completed_reference = Reference(view.camera, appearance.image, depth, view.target, field_.rows, field_.cols)
+    reference = Reference(view.camera, appearance.image, depth, view.target, field_.rows, field_.cols)
     painting: Propagation = run(
-        f"propagate{suffix}",
-        lambda: propagate(completed_reference, to_paint, settings.propagate, run.progress),
+        f"propagate{suffix}", lambda: propagate(reference, to_paint, settings.propagate, run.progress)
     )
     new: Gaussians = run(
         f"seed{suffix}",
-        lambda: colour_gaussians(
-            seeds, view.camera, to_paint, painting.views, scene.sh_degree, settings.seed
-        ),
+        lambda: colour_gaussians(seeds, view.camera, to_paint, painting.views, filled.sh_degree, settings.seed),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
 
 
 def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
+    prior = depth_prior(settings.depth_prior, view.camera.height, view.camera.width)
     known = rim(view, settings.masks.solid)
-    disparity = disparity_of(view.depth_after)
-    prior = depth_prior(settings.depth_prior, view.camera, disparity, known, view.target, settings.depth)
-    return complete_disparity(disparity, known, view.target, prior, settings.depth)
+    return complete_disparity(disparity_of(view.depth_after), known, view.target, prior, settings.depth)
 
 
-def _outside_object(image: np.ndarray, emptied: np.ndarray, view: ViewMasks) -> np.ndarray:
-    """The view without the object, its hole aside: the photo, and the emptied scene where the object was."""
-    return np.where((view.silhouette & ~view.target)[..., None], emptied, image)
+def _appearance(
+    view: ViewMasks,
+    depth: np.ndarray,
+    open_views: Sequence[ViewMasks],
+    photos: dict[str, np.ndarray],
+    base: np.ndarray,
+    settings: RemovalSettings,
+    given: np.ndarray | None,
+) -> Appearance:
+    """The reference without the object: the given picture, or what photos show and the provider's fill for the rest."""
+    if given is not None:
+        return paste_picture(base, view.target, given, "--reference-image")
+    seen = np.zeros_like(view.target)
+    if settings.use_evidence:
+        sources = [(v.camera, photos[v.camera.id], v.depth_before) for v in open_views]
+        evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
+        seen = evidence.seen
+        base = np.where(seen[..., None], evidence.image, base)
+    filled = inpaint_reference(settings.inpaint, base, view.target & ~seen, settings.random_seed)
+    share = seen.sum() / max(1, view.target.sum())
+    return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
 def _still_open(view: ViewMasks, filled: Gaussians, added: int) -> ViewMasks:
@@ -360,4 +372,5 @@ STORED = (
     MappingField,
     Propagation,
     PaintedView,
+    Appearance,
 )

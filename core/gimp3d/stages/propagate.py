@@ -16,7 +16,7 @@ import numpy as np
 from ..camera import Camera
 from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
-from ..solvers.poisson import PoissonSettings, solve_poisson
+from ..solvers.poisson import solve_poisson
 from ..threads import parallel_map
 
 
@@ -43,7 +43,6 @@ class PropagateSettings:
     evidence_margin: int = 3  # px that evidence keeps away from the object
     seam: float = 0.05  # relative depth step across which blending takes no boundary value
     transfer: str = "difference"  # "difference": reference colour + the source's change between views; "sample": paper
-    poisson: PoissonSettings = PoissonSettings(tolerance=1e-3)
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class ViewToPaint:
 
     camera: Camera
     image: np.ndarray  # [H, W, 3] uint8, the photo (or rendering) with the object
-    emptied: np.ndarray  # [H, W, 3] uint8, the scene rendered without the object
+    base: np.ndarray  # [H, W, 3] uint8, without the object: the photo round it, the emptied scene where it was
     silhouette: np.ndarray  # [H, W] bool, touched by the object
     target: np.ndarray  # [H, W] bool, T_t
     depth_before: np.ndarray  # [H, W] z with the object
@@ -115,7 +114,7 @@ def propagate(
 
 def _paint(reference: Reference, view: ViewToPaint, settings: PropagateSettings) -> PaintedView:
     evidence = evidence_pixels(view, settings)
-    base = np.where((view.silhouette & ~evidence)[..., None], view.emptied, view.image)
+    base = np.where(evidence[..., None], view.image, view.base)
     raw = base.astype(np.float32)
     rules = np.zeros(view.target.shape, np.uint8)
     hole = view.target & ~evidence
@@ -171,7 +170,7 @@ def blend(
     nearest_fill = cv2.dilate(fill_depth, np.ones((3, 3), np.uint8))
     rim &= np.abs(nearest_fill - depth) < settings.seam * depth
     guidance = np.where(painted[..., None], raw, np.nan).astype(np.float32)
-    solution = solve_poisson(painted, rim, base.astype(np.float32), guidance, settings.poisson)
+    solution = solve_poisson(painted, rim, base, guidance)
     result = base.copy()
     anchored = painted & ~solution.unanchored
     result[anchored] = _to_bytes(solution.values[anchored])

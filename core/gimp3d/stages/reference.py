@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..camera import Camera
 from ..errors import IllPosed
 from .depth import complete_disparity
-from .masks import ViewMasks
+from .masks import ViewMasks, sees
 
 
 @dataclass(frozen=True)
@@ -112,3 +113,66 @@ def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
     on_border = view.target[0].sum() + view.target[-1].sum() + view.target[:, 0].sum() + view.target[:, -1].sum()
     framed = max(0.0, 1.0 - on_border / max(1.0, 2 * np.sqrt(view.target.sum())))
     return float(cosine * framed**settings.truncation_power)
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """When a photo counts as a true picture of the surface behind the object. Depths relative, lengths in pixels."""
+
+    tolerance: float = 0.006  # how near a view's first surface must be to the completed one
+    margin: int = 3  # px round the sample that must not hold something nearer
+    nearer: float = 0.03  # how much nearer counts as an occluder
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What photos show of the reference's hole."""
+
+    image: np.ndarray  # [H, W, 3] uint8, meaningful where `seen`
+    seen: np.ndarray  # [H, W] bool
+
+
+def gather_evidence(
+    camera: Camera,  # the reference
+    depth: np.ndarray,  # [H, W] its completed z-depth
+    target: np.ndarray,  # [H, W] bool, T_0
+    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
+    settings: EvidenceSettings = EvidenceSettings(),  # noqa: B008
+) -> Evidence:
+    """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.
+
+    What some view saw is copied from that view, never invented (METHOD section 1, `ours`).
+    """
+    rows, cols = np.nonzero(target & (depth > 0))
+    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
+    rays = _directions(points, camera)
+    best = np.full(len(points), -1.0)
+    colours = np.zeros((len(points), 3), np.uint8)
+    for other, photo, seen_depth in views:
+        cosine = (rays * _directions(points, other)).sum(-1)
+        open_points = np.flatnonzero(cosine > best)
+        clear = sees(other, _without_occluders(seen_depth, settings), points[open_points], settings.tolerance)
+        found = open_points[clear]
+        uv, _ = other.project(points[found])
+        colours[found] = cv2.remap(
+            photo, *(uv.astype(np.float32) - 0.5).T[:, :, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )[:, 0] if len(found) else colours[found]
+        best[found] = cosine[found]
+    image = np.zeros((*target.shape, 3), np.uint8)
+    image[rows, cols] = colours
+    seen = np.zeros(target.shape, bool)
+    seen[rows, cols] = best > -1
+    return Evidence(image, seen)
+
+
+def _directions(points: np.ndarray, camera: Camera) -> np.ndarray:
+    towards = points - camera.centre
+    return towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-12)
+
+
+def _without_occluders(depth: np.ndarray, settings: EvidenceSettings) -> np.ndarray:
+    """The depth map with the surroundings of depth edges taken out (0): photos mix colours there."""
+    size = 2 * settings.margin + 1
+    filled = np.where(depth > 0, depth, np.inf).astype(np.float32)
+    nearest = cv2.erode(filled, np.ones((size, size), np.uint8))
+    return np.where(nearest < (1 - settings.nearer) * depth, 0, depth).astype(np.float32)
