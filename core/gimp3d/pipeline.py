@@ -68,7 +68,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper"),
-        depth=DepthSettings(scale_factor=0.1),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic"),
         propagate=PropagateSettings(transfer="sample"),
         use_evidence=False,
         extra_references=0,
@@ -291,8 +291,11 @@ def _fill_from_one_view(
 
 def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
     prior = depth_prior(settings.depth_prior, view.camera.height, view.camera.width)
+    surface = settings.depth_prior if settings.depth_prior in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
-    return complete_disparity(disparity_of(view.depth_after), known, view.target, prior, settings.depth)
+    return complete_disparity(
+        disparity_of(view.depth_after), known, view.target, prior, replace(settings.depth, surface=surface)
+    )
 
 
 def _appearance(

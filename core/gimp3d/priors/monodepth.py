@@ -11,11 +11,11 @@ from ..errors import BadInput
 
 
 def depth_prior(
-    spec: str,  # auto | harmonic | file:PATH[,disparity|,depth]
+    spec: str,  # auto | harmonic | planar | file:PATH[,disparity|,depth]
     height: int,
     width: int,
 ) -> np.ndarray | None:
-    """Relative disparity [H, W] float32 (any scale and shift), or None for harmonic completion.
+    """Relative disparity [H, W] float32 (any scale and shift), or None where the scene alone decides.
 
     Raises
     ------
@@ -23,16 +23,16 @@ def depth_prior(
         If the provider is unknown or its file cannot be used.
     """
     name, _, rest = spec.partition(":")
-    if spec in ("auto", "harmonic"):
+    if spec in ("auto", "harmonic", "planar"):
         return None
     if name == "file":
         path, _, kind = rest.rpartition(",")
         if kind not in ("disparity", "depth"):
             path, kind = rest, "disparity"
         return _from_file(Path(path), kind, height, width)
-    if name in ("onnx", "planar"):
-        raise BadInput(f"--depth-prior {name}: not in this version; use auto, harmonic or file:PATH")
-    raise BadInput(f"--depth-prior: unknown provider {spec!r}; use auto, harmonic or file:PATH[,disparity|,depth]")
+    if name == "onnx":
+        raise BadInput(f"--depth-prior {name}: not in this version; use auto, harmonic, planar or file:PATH")
+    raise BadInput(f"--depth-prior: unknown provider {spec!r}; use auto, harmonic, planar or file:PATH[,disparity|,depth]")
 
 
 def _from_file(path: Path, kind: str, height: int, width: int) -> np.ndarray:

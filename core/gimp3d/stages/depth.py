@@ -15,12 +15,17 @@ from ..solvers.poisson import solve_poisson
 class DepthSettings:
     """Lengths in pixels; disparities relative to the ring's."""
 
+    surface: str = "auto"  # "auto": a plane where the ring is one, else harmonic; "planar" or "harmonic" insist
+    plane_ring: int = 24  # width of the ring on which a plane is sought
+    plane_inlier: float = 0.008  # relative disparity within which a ring pixel lies on the plane
+    plane_share: float = 0.5  # of the ring that must lie on it
+    plane_tries: int = 256  # RANSAC samples
     scale_factor: float | None = None  # s_f; None: measured on the ring. The paper uses 0.1
     ring: int = 12  # width of the ring on which s_f is measured
     gradient_step: int = 6  # differences over this distance are least sensitive to a prior's noise (research, K2)
     minimum_ring: int = 10  # ring pixels below which s_f is undefined
     minimum_correlation: float = 0.3  # between the prior's and the scene's gradients
-    layer_jump: float = 0.25  # relative disparity step between neighbours on the rim that parts two layers
+    layer_jump: float = 0.06  # relative disparity step between neighbours on the rim that parts two layers
     low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
     high: float = 4.0
 
@@ -51,12 +56,21 @@ def complete_disparity(
     The printed divergence has the opposite sign (METHOD section 3). Rim pixels of a layer in front of the hole are
     no boundary (`background_rim`).
 
+    Without a prior, a ring that is one plane is continued as that plane (planes are exactly affine in disparity); what
+    the rim deviates from it is completed harmonically.
+
     Raises
     ------
     IllPosed
-        If the hole has no known rim at all.
+        If the hole has no known rim at all, or a plane was insisted on and there is none.
     """
     fixed = background_rim(disparity, known & ~hole, hole, settings)
+    if prior is None and settings.surface != "harmonic":
+        plane, on_plane, share = ring_plane(disparity, known & ~hole, hole, settings)
+        if share >= settings.plane_share:
+            return _complete_on_plane(disparity, known, hole, plane, on_plane, share, settings)
+        if settings.surface == "planar":
+            raise IllPosed(f"depth: only {share:.0%} of the surroundings lie on one plane; use --depth-prior auto")
     if not (fixed & scipy.ndimage.binary_dilation(hole)).any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     harmonic = solve_poisson(hole, fixed, disparity)
@@ -71,6 +85,76 @@ def complete_disparity(
         nearest = scipy.ndimage.distance_transform_edt(~fixed, return_distances=False, return_indices=True)
         filled = np.where(harmonic.unanchored, disparity[tuple(nearest)], filled)
         confidence, reason = min(confidence, 0.3), reason + "; a part of the hole has no rim: nearest depth used"
+    return _clamped(filled, disparity, known, hole, fixed, s, confidence, reason, settings)
+
+
+def _complete_on_plane(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    hole: np.ndarray,
+    plane: np.ndarray,
+    on_plane: np.ndarray,
+    share: float,
+    settings: DepthSettings,
+) -> DepthCompletion:
+    """The plane plus the harmonic extension of what the rim's pixels on it deviate."""
+    deviation = solve_poisson(hole, known & on_plane & ~hole, disparity - plane)
+    filled = np.where(hole, plane + np.where(deviation.unanchored, 0.0, deviation.values), disparity)
+    words = f"planar: {share:.0%} of the surroundings lie on one plane"
+    return _clamped(filled, disparity, known, hole, known & on_plane, 0.0, share, words, settings)
+
+
+def ring_plane(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    hole: np.ndarray,
+    settings: DepthSettings,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """The plane d = a·u + b·v + c that most of the ring lies on: (plane [H, W], pixels on it [H, W] bool, share).
+
+    RANSAC (Fischler & Bolles 1981) with a fixed seed, refined by least squares on the inliers.
+    """
+    h, w = hole.shape
+    v, u = np.mgrid[:h, :w]
+    rows, cols = np.nonzero(known & scipy.ndimage.binary_dilation(hole, iterations=settings.plane_ring))
+    nothing = np.zeros(hole.shape), np.zeros(hole.shape, bool), 0.0
+    if len(rows) < max(3, settings.minimum_ring):
+        return nothing
+    points = np.stack([cols, rows, np.ones(len(rows))], -1).astype(np.float64)
+    d = disparity[rows, cols].astype(np.float64)
+    tolerance = settings.plane_inlier * max(float(np.median(d)), 1e-12)
+    rng = np.random.default_rng(0)
+    samples = rng.integers(0, len(rows), (settings.plane_tries, 3))
+    systems = points[samples]
+    solvable = np.abs(np.linalg.det(systems)) > 1.0  # three pixels in a line say nothing
+    if not solvable.any():
+        return nothing
+    candidates = np.linalg.solve(systems[solvable], d[samples][solvable][..., None])[..., 0]
+    thin = points[:: max(1, len(points) // 2000)], d[:: max(1, len(points) // 2000)]
+    votes = (np.abs(thin[0] @ candidates.T - thin[1][:, None]) < tolerance).sum(0)
+    best = candidates[int(votes.argmax())]
+    for _ in range(3):
+        on = np.abs(points @ best - d) < tolerance
+        if on.sum() < 3:
+            return nothing
+        best = np.linalg.lstsq(points[on], d[on], rcond=None)[0]
+    plane = best[0] * u + best[1] * v + best[2]
+    share = float((np.abs(points @ best - d) < tolerance).mean())
+    return plane, np.abs(plane - disparity) < tolerance, share
+
+
+def _clamped(
+    filled: np.ndarray,
+    disparity: np.ndarray,
+    known: np.ndarray,
+    hole: np.ndarray,
+    fixed: np.ndarray,
+    scale: float,
+    confidence: float,
+    reason: str,
+    settings: DepthSettings,
+) -> DepthCompletion:
+    """The result with disparities kept to the ring's range (METHOD section 8: disparity ≤ 0 after the solve)."""
     ring = disparity[fixed & scipy.ndimage.binary_dilation(hole, iterations=3)]
     ring = ring[ring > 0]
     low, high = (settings.low * ring.min(), settings.high * ring.max()) if len(ring) else (0.0, np.inf)
@@ -80,7 +164,7 @@ def complete_disparity(
         confidence, reason = confidence * 0.5, f"{reason}; {clamped} pixels clamped to the ring's range"
     clipped = clipped.astype(np.float32)
     depth = np.where(clipped > 0, 1.0 / np.where(clipped > 0, clipped, 1.0), 0.0).astype(np.float32)
-    return DepthCompletion(clipped, depth, s, clamped, confidence, reason)
+    return DepthCompletion(clipped, depth, scale, clamped, confidence, reason)
 
 
 def measure_scale(

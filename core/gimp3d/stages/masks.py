@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 
 from ..box import Box, Region, in_region
 from ..camera import Camera
@@ -30,6 +32,8 @@ class MaskSettings:
     solid: float = 0.9  # alpha after removal from which a surface counts as there
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
+    layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
+    least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
 
 
@@ -228,9 +232,31 @@ def _need_only(view: ViewMasks, views: Sequence[ViewMasks], settings: MaskSettin
         if other is not view:
             open_points = np.flatnonzero(~seen)
             seen[open_points] = sees(other.camera, other.depth_before, points[open_points], settings.depth_tolerance)
-    target = view.silhouette.copy()
-    target[rows[seen], cols[seen]] = False
+    evidence = np.zeros_like(view.silhouette)
+    evidence[rows[seen], cols[seen]] = True
+    target = view.silhouette & ~(evidence & _continues_outside(view, settings))
     return replace(view, target=_tidy(target, view.silhouette, settings.margin))
+
+
+def _continues_outside(view: ViewMasks, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: surfaces that go on beyond what the object touched.
+
+    What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
+    by other views past the table's edge, but it is not what was behind the object.
+    """
+    z = view.depth_after
+    there = (z > 0) & (view.alpha_after >= settings.solid)
+    index = np.arange(z.size).reshape(z.shape)
+    pairs = []
+    for near, far in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        same = there[near] & there[far] & (np.abs(z[near] - z[far]) < settings.layer_step * np.minimum(z[near], z[far]))
+        pairs.append(np.stack([index[near][same], index[far][same]]))
+    a, b = np.concatenate(pairs, axis=1)
+    graph = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (z.size, z.size))
+    count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    surface = surface.reshape(z.shape)
+    outside = np.bincount(surface[there & ~view.silhouette], minlength=count)
+    return there & (outside[surface] >= settings.least_outside)
 
 
 def sees(

@@ -105,7 +105,7 @@ def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
     if view.target.sum() < settings.minimum_pixels:
         return 0.0
     try:
-        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target, None)
+        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target)
     except IllPosed:
         return 0.0
     cosine = facing(view.camera, np.where(view.target, completed.depth, view.depth_after))[view.target].sum()
