@@ -25,6 +25,7 @@ from .stages.propagate import (
     Propagation,
     PropagateSettings,
     Reference,
+    Rule,
     ViewToPaint,
     propagate,
 )
@@ -67,7 +68,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "balanced": RemovalSettings(),
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
-        masks=MaskSettings(mode="paper"),
+        masks=MaskSettings(mode="paper", support=0.0),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic"),
         propagate=PropagateSettings(transfer="sample"),
         use_evidence=False,
@@ -217,7 +218,10 @@ def remove_object(
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
         painted.update({p.camera_id: p.image for p in painting.views})
-        open_views = tuple(parallel_map(lambda v, f=filled, n=len(added): _still_open(v, f, n), masks.views))
+        rules = {p.camera_id: p.rules for p in painting.views}
+        open_views = tuple(
+            parallel_map(lambda v, f=filled, n=len(added), r=rules: _still_open(v, f, n, r[v.camera.id]), open_views)
+        )
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
         run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
@@ -281,12 +285,20 @@ def _fill_from_one_view(
     painting: Propagation = run(
         f"propagate{suffix}", lambda: propagate(reference, to_paint, settings.propagate, run.progress)
     )
+    painting = _with_reference(painting, view, appearance)
     new: Gaussians = run(
         f"seed{suffix}",
         lambda: colour_gaussians(seeds, view.camera, to_paint, painting.views, filled.sh_degree, settings.seed),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
+
+
+def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearance) -> Propagation:
+    """The reference itself shows its own completed picture, not a mapped one."""
+    rules = np.where(view.target, Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+    own = PaintedView(view.camera.id, appearance.image, appearance.image, rules)
+    return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
 
 
 def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
@@ -321,14 +333,17 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
-def _still_open(view: ViewMasks, filled: Gaussians, added: int) -> ViewMasks:
-    """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover."""
+def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray) -> ViewMasks:
+    """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
+
+    A pixel that a splat's edge covers but that got no colour stays open, or the next fill would continue its old one.
+    """
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
     after = render(filled, view.camera, RasterSettings(), frozenset({"depth", "alpha"}))
     return replace(
-        view, target=view.target & ~covered, depth_after=after.median_depth, alpha_after=after.alpha
+        view, target=view.target & (~covered | (rules == Rule.UNREACHED)), depth_after=after.median_depth, alpha_after=after.alpha
     )
 
 

@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import RasterSettings, footprint, render
+from ..raster import RasterSettings, contributions, footprint, render
 from ..threads import parallel_map
 
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
@@ -32,7 +32,10 @@ class MaskSettings:
     solid: float = 0.9  # alpha after removal from which a surface counts as there
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
+    support: float = 0.3  # share of a Gaussian's weight that views must have seen with the object there; 0 keeps all
+    support_pixels: float = 0.5  # summed weight below which a Gaussian does not matter
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
+    occluder_step: float = 0.06  # how much nearer (relative) a kept surface at the outline must be to count as in front
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
 
@@ -44,6 +47,7 @@ class ViewMasks:
     camera: Camera
     polygon: np.ndarray  # bool, the projected boxes
     silhouette: np.ndarray  # bool, pixels that the removed Gaussians touched
+    occluder: np.ndarray  # bool, kept surfaces in front of the object, at its outline
     target: np.ndarray  # bool, T: the pixels to fill
     depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing
     depth_after: np.ndarray  # float32 z without it
@@ -69,6 +73,34 @@ class Masks:
 def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
     """[N] bool: Gaussians whose centre lies in the region (METHOD section 1). Unusable rows are never removed."""
     return in_region(region, gaussians.means.astype(np.float64)) & gaussians.usable
+
+
+def unsupported_gaussians(
+    gaussians: Gaussians,
+    removed: np.ndarray,  # [N] bool
+    cameras: Sequence[Camera],
+    settings: MaskSettings,
+) -> np.ndarray:
+    """[N] bool: kept Gaussians that only the removal reveals (METHOD section 1, contamination).
+
+    Trainers leave smears of the object's colour under and behind its surface, where no photo ever saw them. Their blend
+    weight over all views is small while the object is there and large once it is gone. What really lies behind the
+    object was seen past it in other views, and stays.
+    """
+    if settings.support <= 0:
+        return np.zeros(len(gaussians), bool)
+    kept = gaussians.take(~removed)
+
+    def weights(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        raster = RasterSettings()
+        before = contributions(gaussians, camera, raster).total[~removed]
+        return before, contributions(kept, camera, raster).total
+
+    sums = parallel_map(weights, cameras)
+    before, after = np.sum([b for b, _ in sums], axis=0), np.sum([a for _, a in sums], axis=0)
+    found = np.zeros(len(gaussians), bool)
+    found[~removed] = (after > settings.support_pixels) & (before < settings.support * after)
+    return found
 
 
 def box_polygon(
@@ -169,6 +201,8 @@ def find_masks(
             f"no usable view: of {len(cameras)} cameras {inside} are inside the ROI and the others do not frame it; "
             "add views that look at it from outside"
         )
+    revealed = unsupported_gaussians(gaussians, removed, seeing, settings)
+    removed = removed | revealed
     kept = gaussians.take(~removed)
     done = 0
 
@@ -184,7 +218,10 @@ def find_masks(
         views = parallel_map(lambda v: _need_only(v, views, settings), views)
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
-    reason = f"{len(views)} views see the region; {share:.0%} of its projection needs filling"
+    reason = (
+        f"{len(views)} views see the region; {share:.0%} of its projection needs filling; {int(revealed.sum())} Gaussians "
+        "outside the box go as well: no view saw them unhidden"
+    )
     return Masks(removed, tuple(views), left_out, settings.mode, len(views) / len(cameras), reason)
 
 
@@ -206,7 +243,9 @@ def _measure_view(
     polygon = np.any([fill_polygon(p, camera.width, camera.height) for p in polygons], axis=0)
     before = render(gaussians, camera, raster, frozenset({"depth"}))
     after = render(kept, camera, raster, frozenset({"depth", "alpha"}))
-    silhouette = footprint(gaussians, camera, removed, raster) > settings.changed
+    weight = footprint(gaussians, camera, removed, raster)
+    silhouette = weight > settings.changed
+    occluder = _in_front(before.median_depth, weight > 0.5, settings)
     if settings.mode == "paper":
         guards = np.any(
             [guard_gaussians(gaussians, ~removed & gaussians.usable, p, camera, settings.guard_scale) for p in polygons],
@@ -217,8 +256,16 @@ def _measure_view(
     else:
         target = silhouette
     return ViewMasks(
-        camera, polygon, silhouette, target, before.median_depth, after.median_depth, after.alpha
+        camera, polygon, silhouette, occluder, target & ~occluder, before.median_depth, after.median_depth, after.alpha
     )
+
+
+def _in_front(depth: np.ndarray, object_: np.ndarray, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels at the object's outline whose first surface lies clearly in front of it, and their rim."""
+    size = 2 * settings.margin + 1
+    nearest = cv2.erode(np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32), np.ones((size, size)))
+    front = ~object_ & (depth > 0) & (depth < (1 - settings.occluder_step) * np.where(np.isfinite(nearest), nearest, 0))
+    return cv2.dilate(front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _need_only(view: ViewMasks, views: Sequence[ViewMasks], settings: MaskSettings) -> ViewMasks:
@@ -235,7 +282,7 @@ def _need_only(view: ViewMasks, views: Sequence[ViewMasks], settings: MaskSettin
     evidence = np.zeros_like(view.silhouette)
     evidence[rows[seen], cols[seen]] = True
     target = view.silhouette & ~(evidence & _continues_outside(view, settings))
-    return replace(view, target=_tidy(target, view.silhouette, settings.margin))
+    return replace(view, target=_tidy(target, view.silhouette, settings.margin) & ~view.occluder)
 
 
 def _continues_outside(view: ViewMasks, settings: MaskSettings) -> np.ndarray:

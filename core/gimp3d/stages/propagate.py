@@ -140,7 +140,7 @@ def _paint(reference: Reference, view: ViewToPaint, settings: PropagateSettings)
         rules,
     )
     painted = hole & ((rules == Rule.OWN_PIXELS) | (rules == Rule.REFERENCE))
-    blended = blend(base, raw, painted, view.depth_new, settings)
+    blended = blend(base, raw, painted, hole & ~painted, view.depth_new, settings)
     rules[view.target & evidence] = Rule.EVIDENCE
     return PaintedView(view.camera.id, blended, _to_bytes(raw), rules)
 
@@ -159,13 +159,14 @@ def blend(
     base: np.ndarray,  # [H, W, 3] uint8, the view round the hole
     raw: np.ndarray,  # [H, W, 3] float32, the fill
     painted: np.ndarray,  # [H, W] bool, where the fill is
+    unpainted: np.ndarray,  # [H, W] bool, the rest of the hole: no boundary
     depth: np.ndarray,  # [H, W] z of the new scene
     settings: PropagateSettings,
 ) -> np.ndarray:
     """The fill Poisson-blended into the view, [H, W, 3] uint8; the rim counts only where no depth seam parts it."""
     if not painted.any():
         return base.copy()
-    rim = (cv2.dilate(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~painted & (depth > 0)
+    rim = (cv2.dilate(painted.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~painted & ~unpainted & (depth > 0)
     fill_depth = np.where(painted & (depth > 0), depth, 0).astype(np.float32)
     nearest_fill = cv2.dilate(fill_depth, np.ones((3, 3), np.uint8))
     rim &= np.abs(nearest_fill - depth) < settings.seam * depth

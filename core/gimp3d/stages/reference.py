@@ -38,11 +38,21 @@ def surface_normals(
 ) -> np.ndarray:
     """Unit normals [H, W, 3] of a depth map in camera axes, facing the camera; 0 where depth is missing."""
     points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)) @ camera.R.T
-    right, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    right, down = _difference(points, 1), _difference(points, 0)
     normals = np.cross(down, right)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     valid = (depth > 0)[..., None] & (length > 0)
     return np.where(valid, normals / np.where(length > 0, length, 1), 0.0)
+
+
+def _difference(points: np.ndarray, axis: int) -> np.ndarray:
+    """One-sided differences of [H, W, 3] points, to the side where depth changes less: edges do not tilt normals."""
+    if points.shape[axis] < 2:
+        return np.zeros_like(points)
+    step = np.diff(points, axis=axis)
+    first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
+    forward, backward = np.concatenate([step, last], axis), np.concatenate([first, step], axis)
+    return np.where(np.abs(forward[..., 2:]) <= np.abs(backward[..., 2:]), forward, backward)
 
 
 def facing(
@@ -121,6 +131,7 @@ class EvidenceSettings:
 
     tolerance: float = 0.006  # how near a view's first surface must be to the completed one
     margin: int = 3  # px round the sample that must not hold something nearer
+    contact: int = 4  # px that evidence keeps away from what no photo shows: where the object touches the surface
     nearer: float = 0.03  # how much nearer counts as an occluder
 
 
@@ -162,6 +173,8 @@ def gather_evidence(
     image[rows, cols] = colours
     seen = np.zeros(target.shape, bool)
     seen[rows, cols] = best > -1
+    unseen = (target & ~seen).astype(np.uint8)
+    seen &= cv2.dilate(unseen, np.ones((2 * settings.contact + 1,) * 2, np.uint8)) == 0
     return Evidence(image, seen)
 
 
