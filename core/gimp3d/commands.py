@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, rem
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .stages.masks import MaskSettings, find_masks
+from .report import write_removal_report
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
 
@@ -200,8 +200,6 @@ def run_removal(
             write_png(target.with_name(target.name + ".png"), image)
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
-        from .report import write_removal_report
-
         write_removal_report(Path(job.report), file.gaussians, views, result, summary)
     for path in filter(None, (job.summary, folder and folder / "summary.json")):
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
@@ -299,7 +297,6 @@ def _summary(
     seconds: float,
 ) -> dict[str, Any]:
     removed, added = int((~result.keep).sum()), len(result.added) if result.added else 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 if sys.platform == "darwin" else 1024**-1 * 1024)
     return {
         "version": __version__,
         "command": "remove",
@@ -315,8 +312,18 @@ def _summary(
         },
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],
-        "peak_memory_mb": round(peak / 1024, 1),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
     }
+
+
+def peak_memory_mb() -> float:
+    """The largest resident size of this process so far; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    unit = 1024**2 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def _job_key(job: RemovalJob, views: Sequence[View]) -> str:

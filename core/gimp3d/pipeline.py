@@ -89,11 +89,12 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Picture:
-    """A stage's result to look at; kinds are drawn by evaluate.report."""
+    """A stage's result to look at; `report` draws it by its kind."""
 
-    stage: str
-    camera_id: str
-    data: dict[str, np.ndarray]
+    kind: str  # mask | depth | appearance | mapping | rules
+    title: str
+    image: np.ndarray  # [H, W, 3] uint8, the view
+    data: tuple[np.ndarray, ...]  # per kind: (target) | (depth, target) | (target) | (rows, cols) | (rules)
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,9 @@ def remove_object(
     run = _Run(store, progress)
     masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress))
     keep = ~masks.removed
+    photos = {v.camera.id: v.image for v in views}
+    for v in _spread(masks.views):
+        run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if not masks.removed.any():
         return _finish(run, keep, None, masks, {}, ["nothing to remove: the region holds no Gaussian"])
     if masks.left_out:
@@ -187,7 +191,6 @@ def remove_object(
     if masks.hole_pixels == 0:
         return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
     kept = scene.take(keep)
-    photos = {v.camera.id: v.image for v in views}
     painted = {
         v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
         for v in masks.views
@@ -286,6 +289,13 @@ def _fill_from_one_view(
         f"propagate{suffix}", lambda: propagate(reference, to_paint, settings.propagate, run.progress)
     )
     painting = _with_reference(painting, view, appearance)
+    name = view.camera.id
+    run.pictures += [
+        Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
+        Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
+        Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
+        *(Picture("rules", f"Filled view {p.camera_id}", p.image, (p.rules,)) for p in _spread(painting.views)),
+    ]
     new: Gaussians = run(
         f"seed{suffix}",
         lambda: colour_gaussians(seeds, view.camera, to_paint, painting.views, filled.sh_degree, settings.seed),
@@ -345,6 +355,11 @@ def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarra
     return replace(
         view, target=view.target & (~covered | (rules == Rule.UNREACHED)), depth_after=after.median_depth, alpha_after=after.alpha
     )
+
+
+def _spread(items: Sequence[R], count: int = 3) -> list[R]:
+    """A few of many, evenly."""
+    return [items[k * len(items) // count] for k in range(min(count, len(items)))]
 
 
 def _open_share(open_views: Sequence[ViewMasks], masks: Masks) -> float:

@@ -1,0 +1,125 @@
+"""PSNR, SSIM and FLIP against true pictures, averaged inside a mask (CONTRACT: evaluate)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..errors import BadInput
+from ..io.images import read_image, read_mask
+
+PIXELS_PER_DEGREE = 67.0  # FLIP's default viewing condition
+PSNR_OF_EQUAL = 100.0  # dB reported for identical pictures, as JSON knows no infinity
+SSIM_SIGMA, SSIM_SIDE = 1.5, 11  # Wang et al. 2004
+
+
+def psnr(
+    pred: np.ndarray,  # [H, W, 3] uint8
+    truth: np.ndarray,  # [H, W, 3] uint8
+    mask: np.ndarray,  # [H, W] bool, not empty
+) -> float:
+    """Peak signal-to-noise ratio in dB over the mask's pixels and channels."""
+    error = ((pred[mask].astype(np.float64) - truth[mask]) ** 2).mean()
+    return PSNR_OF_EQUAL if error == 0 else min(PSNR_OF_EQUAL, 10 * float(np.log10(255.0**2 / error)))
+
+
+def ssim_map(
+    pred: np.ndarray,  # [H, W, 3] uint8
+    truth: np.ndarray,  # [H, W, 3] uint8
+) -> np.ndarray:
+    """Structural similarity per pixel, mean of the channels, [H, W] (Wang et al. 2004, Gaussian window, σ 1.5)."""
+    a, b = pred.astype(np.float64) / 255, truth.astype(np.float64) / 255
+
+    def blur(x: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(x, (SSIM_SIDE, SSIM_SIDE), SSIM_SIGMA, borderType=cv2.BORDER_REFLECT_101)
+
+    c1, c2 = 0.01**2, 0.03**2
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2
+    covariance = blur(a * b) - mean_a * mean_b
+    top = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return (top / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(-1)
+
+
+def flip_map(
+    pred: np.ndarray,  # [H, W, 3] uint8
+    truth: np.ndarray,  # [H, W, 3] uint8
+) -> np.ndarray:
+    """LDR-FLIP per pixel, [H, W] in [0, 1] (Andersson et al. 2020), by NVIDIA's flip-evaluator.
+
+    Raises
+    ------
+    BadInput
+        If flip-evaluator is not installed.
+    """
+    try:
+        import flip_evaluator
+    except ImportError:
+        raise BadInput("evaluate: FLIP needs the package flip-evaluator (pip install 'gimp3d[evaluate]')") from None
+    error, _, _ = flip_evaluator.evaluate(
+        truth.astype(np.float32) / 255,
+        pred.astype(np.float32) / 255,
+        "LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"ppd": PIXELS_PER_DEGREE},
+    )
+    return np.asarray(error, np.float64).reshape(pred.shape[:2])
+
+
+def score(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """PSNR, SSIM and FLIP in the mask. What lies outside does not count (windows reach out by their radius)."""
+    return {
+        "psnr": psnr(pred, truth, mask),
+        "ssim": float(ssim_map(pred, truth)[mask].mean()),
+        "flip": float(flip_map(pred, truth)[mask].mean()),
+    }
+
+
+def evaluate_folders(
+    pred: Path,
+    truth: Path,
+    masks: Path,
+    mask_suffix: str = ".mask.png",
+    exclude: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Scores of every picture that both folders have: {"views": {stem: {psnr, ssim, flip}}, "mean", "warnings"}.
+
+    A picture's stem is its path below `pred` without .png; its mask is stem + suffix, else stem.png. Excluded are
+    stems, with or without extension and leading folders (test/000.png, test/000 and 000 all name 000.png).
+
+    Raises
+    ------
+    BadInput
+        If a folder is missing, nothing pairs up, or sizes differ.
+    """
+    for folder in (pred, truth, masks):
+        if not folder.is_dir():
+            raise BadInput(f"evaluate: {folder} is not a folder")
+    left_out = {e.removesuffix(".png") for e in exclude}
+    views: dict[str, dict[str, float]] = {}
+    warnings: list[str] = []
+    for path in sorted(pred.rglob("*.png")):
+        stem = path.relative_to(pred).as_posix().removesuffix(".png")
+        if any(stem == e or e.endswith("/" + stem) or stem.endswith("/" + e) for e in left_out):
+            continue
+        true = truth / f"{stem}.png"
+        mask_path = next((m for m in (masks / f"{stem}{mask_suffix}", masks / f"{stem}.png") if m.exists()), None)
+        if not true.exists() or mask_path is None:
+            continue
+        picture, answer, mask = read_image(path), read_image(true), read_mask(mask_path)
+        if not picture.shape[:2] == answer.shape[:2] == mask.shape:
+            sizes = ", ".join(f"{s[1]}×{s[0]}" for s in (picture.shape, answer.shape, mask.shape))
+            raise BadInput(f"evaluate: {stem}: picture, truth and mask differ in size ({sizes})")
+        if not mask.any():
+            warnings.append(f"{stem}: the mask is empty, not scored")
+            continue
+        views[stem] = score(picture, answer, mask)
+    if not views:
+        raise BadInput(f"evaluate: no picture of {pred} has a truth in {truth} and a mask in {masks}")
+    mean = {k: float(np.mean([v[k] for v in views.values()])) for k in ("psnr", "ssim", "flip")}
+    return {"views": views, "mean": mean, "warnings": warnings}

@@ -1,0 +1,158 @@
+"""A one-page HTML report of a removal: before and after, what each stage saw, how long it took."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .gaussians import Gaussians
+from .io.images import write_png
+from .job import write_atomically
+from .pipeline import Picture, RemovalResult, View, render_bytes
+from .stages.propagate import Rule
+
+RULE_COLOURS = {
+    Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
+    Rule.OWN_PIXELS: ("this view's own pixels, mapped", (70, 120, 220)),
+    Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
+    Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
+}
+STYLE = """
+:root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
+body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.6rem;margin:0}h2{font-size:1.15rem;margin:2rem 0 .6rem}
+table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.3rem .6rem;border-bottom:1px solid var(--edge)}
+td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:1rem}
+figure{margin:0}figure img{width:100%;border-radius:6px;display:block}figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
+.flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}.flip:hover img+img{opacity:1}
+.bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
+.warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
+.dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
+""".strip()
+
+
+def write_removal_report(
+    folder: Path, scene: Gaussians, views: Sequence[View], result: RemovalResult, summary: dict[str, Any]
+) -> Path:
+    """Write index.html and its pictures into `folder`; returns the page's path."""
+    kept = scene.take(result.keep)
+    after = kept if result.added is None else kept.extended(result.added)
+    chosen = [views[k * len(views) // 6] for k in range(min(6, len(views)))]
+    pairs = []
+    for k, view in enumerate(chosen):
+        names = (f"before_{k}.png", f"after_{k}.png")
+        write_png(folder / names[0], render_bytes(scene, view.camera))
+        write_png(folder / names[1], render_bytes(after, view.camera))
+        pairs.append((view.camera.id, *names))
+    stage_pictures = []
+    for k, picture in enumerate(result.pictures):
+        name = f"stage_{k:02d}.png"
+        write_png(folder / name, draw(picture))
+        stage_pictures.append((picture.title, name))
+    page = _page(summary, pairs, stage_pictures)
+    write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
+    return folder / "index.html"
+
+
+def draw(picture: Picture) -> np.ndarray:
+    """A stage's result as a picture, [H, W, 3] uint8."""
+    if picture.kind == "mask":
+        return tinted(picture.image, picture.data[0], (230, 60, 60))
+    if picture.kind == "depth":
+        return relief(picture.data[0], picture.data[1])
+    if picture.kind == "mapping":
+        return offset_colours(picture.image, *picture.data)
+    if picture.kind == "rules":
+        marked = picture.image
+        for rule, (_, colour) in RULE_COLOURS.items():
+            marked = tinted(marked, picture.data[0] == rule, colour, 0.35)
+        return np.hstack([picture.image, marked])
+    return outlined(picture.image, picture.data[0])
+
+
+def tinted(
+    image: np.ndarray,  # [H, W, 3] uint8
+    mask: np.ndarray,  # [H, W] bool
+    colour: tuple[int, int, int],
+    strength: float = 0.5,
+) -> np.ndarray:
+    """The image with a colour laid over the mask."""
+    mixed = (1 - strength) * image + strength * np.array(colour)
+    return np.where(mask[..., None], mixed, image).astype(np.uint8)
+
+
+def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """The image with the mask's outline drawn on it."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return cv2.drawContours(image.copy(), contours, -1, (230, 60, 60), 1)
+
+
+def relief(
+    depth: np.ndarray,  # [H, W] z, 0 = nothing
+    mask: np.ndarray,  # [H, W] bool, outlined
+) -> np.ndarray:
+    """Depth as colour, shaded like a relief."""
+    disparity = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+    there = disparity[depth > 0]
+    low, high = np.percentile(there, [2, 98]) if len(there) else (0.0, 1.0)
+    colour = cv2.applyColorMap(
+        (np.clip((disparity - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS
+    )[..., ::-1]
+    slope = np.gradient(disparity, axis=0) / max(high - low, 1e-12)
+    shade = np.clip(1 + 12 * slope, 0.6, 1.3)[..., None]
+    shaded = np.where((depth > 0)[..., None], np.clip(colour * shade, 0, 255), 40).astype(np.uint8)
+    return outlined(shaded, mask)
+
+
+def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+    """Offsets of a mapping field: hue is the direction, brightness the length."""
+    y, x = np.mgrid[: rows.shape[0], : rows.shape[1]]
+    dy, dx = (rows - y).astype(np.float32), (cols - x).astype(np.float32)
+    length, angle = np.hypot(dx, dy), np.degrees(np.arctan2(dy, dx)) % 360
+    there = rows >= 0
+    longest = max(1.0, float(length[there].max())) if there.any() else 1.0
+    hsv = np.stack([angle / 2, np.full_like(angle, 200), 80 + 175 * np.clip(length / longest, 0, 1)], -1)
+    colour = cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
+    return np.where(there[..., None], colour, image // 2)
+
+
+def _page(
+    summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictures: Sequence[tuple[str, str]]
+) -> str:
+    counts, text = summary["counts"], html.escape
+    longest = max((s["seconds"] for s in summary["stages"]), default=1) or 1
+    rows = "".join(
+        f"<tr><td>{text(s['name'])}</td><td class=n>{s['seconds']:.2f} s</td>"
+        f"<td style='width:22%'><div class=bar style='width:{100 * s['seconds'] / longest:.0f}%'></div></td>"
+        f"<td class=n>{s['confidence']:.0%}</td><td>{text(s['reason'])}</td></tr>"
+        for s in summary["stages"]
+    )
+    before_after = "".join(
+        f"<figure><div class=flip><img src='{a}' alt='before'><img src='{b}' alt='after'></div>"
+        f"<figcaption>{text(name)} – hover to see it without the object</figcaption></figure>"
+        for name, a, b in pairs
+    )
+    stages = "".join(
+        f"<figure><img src='{name}' alt=''><figcaption>{text(title)}</figcaption></figure>" for title, name in pictures
+    )
+    legend = "".join(
+        f"<span class=dot style='background:rgb{colour}'></span>{text(words)}" for words, colour in RULE_COLOURS.values()
+    )
+    warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
+    numbers = "".join(f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>" for k, v in counts.items())
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
+        f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"
+        f"<p>{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
+        f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>{warnings}"
+        f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
+        f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
+        f"<h2>What each stage saw</h2><p>{legend}</p><div class=grid>{stages}</div>"
+        f"<h2>Counts</h2><table>{numbers}</table></html>\n"
+    )
