@@ -30,6 +30,7 @@ class MaskSettings:
     guard_footprint: float = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
     changed: float = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
     solid: float = 0.9  # alpha after removal from which a surface counts as there
+    void: float = 0.1  # alpha after removal below which there is nothing
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
     support: float = 0.3  # share of a Gaussian's weight that views must have seen with the object there; 0 keeps all
@@ -281,22 +282,25 @@ def _need_only(view: ViewMasks, views: Sequence[ViewMasks], settings: MaskSettin
             seen[open_points] = sees(other.camera, other.depth_before, points[open_points], settings.depth_tolerance)
     evidence = np.zeros_like(view.silhouette)
     evidence[rows[seen], cols[seen]] = True
+    evidence |= view.alpha_after < settings.void
     target = view.silhouette & ~(evidence & _continues_outside(view, settings))
     return replace(view, target=_tidy(target, view.silhouette, settings.margin) & ~view.occluder)
 
 
 def _continues_outside(view: ViewMasks, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: surfaces that go on beyond what the object touched.
+    """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
     by other views past the table's edge, but it is not what was behind the object.
     """
     z = view.depth_after
-    there = (z > 0) & (view.alpha_after >= settings.solid)
+    void = view.alpha_after < settings.void
+    there = (z > 0) & (view.alpha_after >= settings.solid) | void
     index = np.arange(z.size).reshape(z.shape)
     pairs = []
     for near, far in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        same = there[near] & there[far] & (np.abs(z[near] - z[far]) < settings.layer_step * np.minimum(z[near], z[far]))
+        close = np.abs(z[near] - z[far]) < settings.layer_step * np.minimum(z[near], z[far])
+        same = there[near] & there[far] & np.where(void[near], void[far], close & ~void[far])
         pairs.append(np.stack([index[near][same], index[far][same]]))
     a, b = np.concatenate(pairs, axis=1)
     graph = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (z.size, z.size))

@@ -1,0 +1,41 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
+
+from scenes import REGION, cameras, scene
+
+from gimp3d.box import Region
+from gimp3d.camera import Camera
+from gimp3d.gaussians import Gaussians
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def block_scene() -> Gaussians:
+    return scene()
+
+
+@pytest.fixture(scope="session")
+def block_region() -> Region:
+    return REGION
+
+
+@pytest.fixture(scope="session")
+def block_cameras() -> tuple[Camera, ...]:
+    return cameras()
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The measured scenes, where they lie beside the checkout."""
+    if not SHARED.is_dir():
+        pytest.skip("the data folder ../shared/data is not here")
+    return SHARED
