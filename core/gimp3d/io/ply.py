@@ -76,7 +76,7 @@ def read_ply(path: Path | str) -> SplatFile:
     """
     path = Path(path)
     table = read_table(path)
-    return SplatFile(_gaussians(path, table), table)
+    return SplatFile(gaussians_of(table, path), table)
 
 
 def write_ply(
@@ -264,7 +264,8 @@ def values(table: PlyTable, path: Path | str = "PLY") -> np.ndarray:
     return records
 
 
-def _gaussians(path: Path, table: PlyTable) -> Gaussians:
+def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
+    """The Gaussians that a table holds; raises BadInput if it does not hold any."""
     names = [p.name for p in table.properties]
     records = values(table, path)
 

@@ -1,0 +1,182 @@
+"""Blender objects ↔ gimp3d types. The one place where Blender's axes, units and lenses become K and [R|t].
+
+The core works in the splat object's local frame, which is the file's: cameras and boxes are brought there, splats never
+move. A uniform scale of the object changes depths, not pictures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import bpy
+import numpy as np
+from gimp3d.box import Box, box_from_matrix
+from gimp3d.camera import Camera, Distortion
+from gimp3d.errors import BadInput
+from mathutils import Matrix
+
+BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
+CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
+SENSOR = 36.0  # mm, of imported cameras
+
+
+def splat_frame(obj: bpy.types.Object) -> np.ndarray:
+    """The object's local→world matrix [4, 4].
+
+    Raises
+    ------
+    BadInput
+        If it mirrors, shears or scales unevenly: SH and covariances would have to change with it.
+    """
+    matrix = np.array(obj.matrix_world, dtype=np.float64)
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if lengths.min() < 1e-12 or lengths.max() / lengths.min() > 1.0001:
+        raise BadInput(f"{obj.name} is scaled unevenly; give it the same scale on all axes (Object > Clear > Scale)")
+    axes = matrix[:3, :3] / lengths
+    if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-4 or np.linalg.det(axes) < 0:
+        raise BadInput(f"{obj.name} is mirrored or sheared; clear its scale (Object > Clear > Scale)")
+    return matrix
+
+
+def camera_from_blender(
+    obj: bpy.types.Object,
+    frame: np.ndarray,  # [4, 4] local→world of the splat object
+    scene: bpy.types.Scene,
+    depsgraph: bpy.types.Depsgraph,
+    name: str | None = None,
+) -> Camera:
+    """A Blender camera in the splat's frame, as the scene's render settings frame it.
+
+    Sensor fit, shift, pixel aspect and resolution percentage come out of Blender's own projection matrix.
+
+    Raises
+    ------
+    BadInput
+        If it is not a perspective camera.
+    """
+    data = obj.data
+    if data.type != "PERSP":
+        raise BadInput(f"camera {obj.name} is {data.type.lower()}; only perspective cameras can be views")
+    pose = np.array(obj.evaluated_get(depsgraph).matrix_world, dtype=np.float64)
+    local = np.linalg.inv(frame) @ pose
+    u, _, vt = np.linalg.svd(local[:3, :3])
+    rotation = u @ vt  # without the camera's and the splat's scale
+    if np.linalg.det(rotation) < 0:
+        raise BadInput(f"camera {obj.name} is mirrored; clear its scale")
+    to_local = np.eye(4)
+    to_local[:3, :3], to_local[:3, 3] = rotation, local[:3, 3]
+    viewmat = np.linalg.inv(to_local @ BLENDER_TO_OPENCV)
+    if CAMERA in obj:
+        stored = json.loads(obj[CAMERA])
+        distortion = Distortion(*stored["distortion"]) if stored["distortion"] else None
+        image = Path(stored["image"]) if stored["image"] else None
+        size = (stored["width"], stored["height"])
+        intrinsics = (stored["fx"], stored["fy"], stored["cx"], stored["cy"])
+        return Camera(name or stored["id"], *size, *intrinsics, viewmat, "train", image, distortion)
+    render = scene.render
+    width = max(1, int(render.resolution_x * render.resolution_percentage / 100))
+    height = max(1, int(render.resolution_y * render.resolution_percentage / 100))
+    p = obj.calc_matrix_camera(
+        depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
+    )
+    fx, fy = width / 2 * p[0][0], height / 2 * p[1][1]
+    cx, cy = width / 2 * (1 - p[0][2]), height / 2 * (1 + p[1][2])
+    return Camera(name or safe_name(obj.name), width, height, fx, fy, cx, cy, viewmat)
+
+
+def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
+    """A Blender camera (not yet linked) that frames what `camera` does; its exact numbers travel with it."""
+    data = bpy.data.cameras.new(camera.id)
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
+    data.lens = camera.fx * SENSOR / camera.width
+    data.shift_x = (camera.width / 2 - camera.cx) / camera.width
+    data.shift_y = (camera.cy - camera.height / 2) / camera.width
+    obj = bpy.data.objects.new(camera.id, data)
+    local = Matrix((np.linalg.inv(camera.viewmat) @ BLENDER_TO_OPENCV).tolist())
+    location, rotation, _ = (frame @ local).decompose()
+    obj.matrix_world = Matrix.LocRotScale(location, rotation, None)
+    obj[CAMERA] = json.dumps(
+        {
+            "id": camera.id,
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "distortion": camera.distortion.coefficients.tolist() if camera.distortion else None,
+            "image": str(camera.image.resolve()) if camera.image and camera.image.exists() else None,
+        }
+    )
+    return obj
+
+
+def box_from_blender(obj: bpy.types.Object, frame: np.ndarray) -> Box:
+    """A cube (any mesh's bounds) in the splat's frame; any rotation, scale and parent.
+
+    Raises
+    ------
+    BadInput
+        If it is flat or sheared.
+    """
+    corners = np.array([tuple(c) for c in obj.bound_box], dtype=np.float64)
+    matrix = np.linalg.inv(frame) @ np.array(obj.matrix_world, dtype=np.float64)
+    try:
+        return box_from_matrix(matrix, corners.min(0), corners.max(0))
+    except BadInput as error:
+        raise BadInput(f"{obj.name}: {error}") from None
+
+
+def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
+    """The cameras that scene.gimp3d.views chooses, in the splat's frame, with the objects they come from.
+
+    Raises
+    ------
+    BadInput
+        If there is none, with what to do.
+    """
+    scene, settings = context.scene, context.scene.gimp3d
+    if settings.views == "ANIMATED":
+        yield from _frames(context, frame)
+        return
+    chosen = chosen_cameras(scene)
+    if not chosen:
+        raise BadInput("no camera to look from; add views (3D-GIMP panel, step 3)")
+    depsgraph = context.evaluated_depsgraph_get()
+    for obj in chosen:
+        yield camera_from_blender(obj, frame, scene, depsgraph), obj
+    if settings.reference and settings.reference not in chosen:
+        yield camera_from_blender(settings.reference, frame, scene, depsgraph), settings.reference
+
+
+def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """Camera objects of the scene or of the chosen collection, by name."""
+    settings = scene.gimp3d
+    if settings.views == "COLLECTION":
+        if settings.view_collection is None:
+            raise BadInput("choose the collection whose cameras are the views")
+        pool: Sequence[bpy.types.Object] = settings.view_collection.all_objects
+    else:
+        pool = scene.objects
+    return sorted((o for o in pool if o.type == "CAMERA"), key=lambda o: o.name)
+
+
+def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
+    scene, obj = context.scene, context.scene.camera
+    if obj is None:
+        raise BadInput("the scene has no active camera whose frames could be the views")
+    current = scene.frame_current, scene.frame_subframe
+    try:
+        for number in range(scene.frame_start, scene.frame_end + 1, scene.frame_step):
+            scene.frame_set(number)
+            depsgraph = context.evaluated_depsgraph_get()
+            yield camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"), obj
+    finally:
+        scene.frame_set(current[0], subframe=current[1])
+
+
+def safe_name(name: str) -> str:
+    """An object's name as a camera ID: no path in it."""
+    return name.replace("/", "_").replace("\\", "_").replace("..", "_").strip() or "camera"

@@ -1,0 +1,104 @@
+"""Job folders made from the Blender scene: everything the core needs, in files that can be run anywhere."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+from gimp3d.camera import Camera
+from gimp3d.errors import BadInput
+from gimp3d.io.cameras import write_transforms
+from gimp3d.io.ply import write_ply
+from gimp3d.job import RemovalJob, save_job, write_atomically
+
+from . import bridge, splats
+from .operators.base import current_boxes, current_splat
+from .properties import GIMP3D_preferences
+
+
+def jobs_folder() -> Path:
+    """Beside the saved .blend, else in the extension's user folder: never where it dies with Blender."""
+    if bpy.data.filepath:
+        return Path(bpy.data.filepath).parent / "gimp3d_jobs"
+    package = GIMP3D_preferences.bl_idname
+    if package.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(package, path="jobs", create=True))
+    return Path(bpy.utils.user_resource("DATAFILES", path="gimp3d/jobs", create=True))
+
+
+def new_job_folder(name: str) -> Path:
+    clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "scene"
+    root = jobs_folder()
+    number = 1
+    while (root / f"{clean}-{number:03d}").exists():
+        number += 1
+    return root / f"{clean}-{number:03d}"
+
+
+def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
+    """The scene, cameras, region, photos and settings as a job folder; returns the job with absolute paths.
+
+    Raises
+    ------
+    BadInput
+        If something is missing or cannot be used, with what to do.
+    """
+    settings = context.scene.gimp3d
+    splat, boxes = current_splat(context), current_boxes(context)
+    if splat is None:
+        raise BadInput("no splat object; import a PLY first (3D-GIMP panel, step 1)")
+    if not boxes:
+        raise BadInput("no box round the object; add one (3D-GIMP panel, step 2)")
+    context.view_layer.update()
+    frame = bridge.splat_frame(splat)
+    region = [bridge.box_from_blender(b, frame).to_json() for b in boxes]
+    reference = ""
+    cameras: list[Camera] = []
+    for camera, obj in bridge.views_of(context, frame):
+        cameras.append(camera)
+        if settings.reference is not None and obj == settings.reference and not reference:
+            reference = camera.id
+    picture = bpy.path.abspath(settings.reference_image) if settings.reference_image else ""
+    if picture and not Path(picture).is_file():
+        raise BadInput(f"the reference picture {picture} does not exist")
+    if picture and not reference:
+        raise BadInput("a reference picture needs its camera; choose the reference view")
+    file = splats.read_object(splat)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
+    write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c in cameras])
+    write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
+    if picture:
+        shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")
+    job = RemovalJob(
+        scene=str(folder / "scene.ply"),
+        cameras=str(folder / "transforms.json"),
+        roi=str(folder / "roi.json"),
+        out=str(folder / "out.ply"),
+        images=None if any(c.image for c in cameras) else "none",
+        reference=reference or None,
+        reference_image=str(folder / f"reference{Path(picture).suffix}") if picture else None,
+        inpaint=settings.inpaint,
+        depth_prior=settings.depth_prior,
+        preset=settings.preset,
+        report=str(folder / "report"),
+        summary=str(folder / "summary.json"),
+        seed=settings.seed,
+    )
+    save_job(folder, job)
+    return job
+
+
+def _with_photo(camera: Camera, folder: Path) -> Camera:
+    """The camera with its photo copied into the job, under an ID that names the file."""
+    if camera.image is None or not camera.image.is_file():
+        return camera
+    name = camera.id if Path(camera.id).suffix else camera.id + camera.image.suffix
+    target = folder / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy2(camera.image, target)
+    return replace(camera, image=target)

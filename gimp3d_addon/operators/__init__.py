@@ -1,0 +1,1 @@
+"""Thin operators: they read the scene, call the core, and show the result."""

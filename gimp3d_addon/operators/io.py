@@ -1,0 +1,91 @@
+"""Splat scenes in and out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import EnumProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper, ImportHelper
+from gimp3d.errors import BadInput
+from gimp3d.io.ply import read_ply, write_ply
+
+from .. import splats
+from .base import ReportsErrors, current_splat, link
+
+UP_ITEMS = (
+    ("FILE", "As in the file", "Keep the file's axes"),
+    ("Y_DOWN", "Y down → Z up", "Scenes with y pointing down, as most from COLMAP photos"),
+    ("Y_UP", "Y up → Z up", "Scenes with y pointing up"),
+)
+
+
+class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
+    """Import a Gaussian splat scene; its numbers are kept exactly"""
+
+    bl_idname = "gimp3d.import_ply"
+    bl_label = "Import Splat PLY"
+    bl_options = {"REGISTER", "UNDO"}
+    filename_ext = ".ply"
+
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    up: EnumProperty(items=UP_ITEMS, name="Up", default="FILE", description="Goes into the object's matrix only")
+
+    def work(self, context: bpy.types.Context) -> None:
+        path = Path(bpy.path.abspath(self.filepath))
+        file = read_ply(path)
+        if file.table.before or file.table.after:
+            self.report({"WARNING"}, "elements other than vertex are not kept")
+        obj = splats.create_object(splats.default_name(path), file, splats.UP_AXES[self.up])
+        link(context, obj)
+        for other in context.selected_objects:
+            other.select_set(False)
+        obj.select_set(True)
+        context.view_layer.objects.active = obj
+        context.scene.gimp3d.splat = obj
+        self.report({"INFO"}, f"{len(file.gaussians)} Gaussians, SH degree {file.gaussians.sh_degree}")
+
+
+class GIMP3D_OT_export_ply(ReportsErrors, bpy.types.Operator, ExportHelper):
+    """Export the splat object as the PLY it came from; deleted vertices are left out"""
+
+    bl_idname = "gimp3d.export_ply"
+    bl_label = "Export Splat PLY"
+    filename_ext = ".ply"
+
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Select a splat object, or import one")
+        return current_splat(context) is not None
+
+    def work(self, context: bpy.types.Context) -> None:
+        active = context.active_object
+        obj = active if splats.is_splat(active) else current_splat(context)
+        if obj is None:
+            raise BadInput("no splat object to export")
+        file = splats.read_object(obj)
+        write_ply(Path(bpy.path.abspath(self.filepath)), file, np.ones(len(file.gaussians), bool))
+
+
+def _menu_import(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    self.layout.operator(GIMP3D_OT_import_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply)")
+
+
+def _menu_export(self: bpy.types.Menu, context: bpy.types.Context) -> None:
+    self.layout.operator(GIMP3D_OT_export_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply)")
+
+
+CLASSES = (GIMP3D_OT_import_ply, GIMP3D_OT_export_ply)
+
+
+def register() -> None:
+    bpy.types.TOPBAR_MT_file_import.append(_menu_import)
+    bpy.types.TOPBAR_MT_file_export.append(_menu_export)
+
+
+def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_import.remove(_menu_import)
+    bpy.types.TOPBAR_MT_file_export.remove(_menu_export)

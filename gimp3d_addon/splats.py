@@ -1,0 +1,263 @@
+"""A Gaussian scene as a Blender object: mesh vertices, named attributes, instances on points, a falloff material.
+
+Every PLY property is kept losslessly in its own attribute, so that an export gives the file's bytes back; the attributes
+`scale`, `rotation`, `opacity` and `color` hold activated values for drawing.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+from gimp3d.errors import BadInput
+from gimp3d.gaussians import SH_C0, Gaussians
+from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussians_of, values
+from mathutils import Matrix
+
+TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
+RAW = "ply:"  # prefix of the attributes that hold the file's numbers
+GROUP, MATERIAL = "3D-GIMP splats", "3D-GIMP splat"
+EXTENT = 3.0  # standard deviations drawn
+MANY = 200_000  # from here on splats are shown as points unless the user asks otherwise
+UP_AXES = {
+    "FILE": Matrix.Identity(4),
+    "Y_DOWN": Matrix.Rotation(np.radians(-90), 4, "X"),  # COLMAP's usual scenes: (x, y, z) → (x, z, −y)
+    "Y_UP": Matrix.Rotation(np.radians(90), 4, "X"),
+}
+
+
+def is_splat(candidate: bpy.types.Object | None) -> bool:
+    """Whether an object was made by `create_object`."""
+    return candidate is not None and candidate.type == "MESH" and TABLE in candidate.data
+
+
+def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Object:
+    """A new object (not yet linked) that shows the scene and can be exported byte for byte."""
+    mesh = bpy.data.meshes.new(name)
+    records = values(file.table)
+    gaussians = file.gaussians
+    mesh.vertices.add(len(gaussians))
+    usable = gaussians.usable
+    mesh.attributes["position"].data.foreach_set(
+        "vector", np.where(usable[:, None], gaussians.means, 0).astype(np.float32).ravel()
+    )
+    for prop in file.table.properties:
+        _store_raw(mesh, prop, records[prop.name])
+    _store_display(mesh, gaussians, usable)
+    table = file.table
+    mesh[TABLE] = json.dumps(
+        {
+            "header": table.header,
+            "line_end": table.line_end,
+            "format": table.format,
+            "properties": [[p.name, p.type] for p in table.properties],
+        }
+    )
+    mesh.materials.append(splat_material())
+    obj = bpy.data.objects.new(name, mesh)
+    obj.matrix_world = matrix
+    modifier = obj.modifiers.new(GROUP, "NODES")
+    modifier.node_group = node_group()
+    modifier[_socket("As Points")] = len(gaussians) > MANY
+    return obj
+
+
+def read_object(obj: bpy.types.Object) -> SplatFile:
+    """The file that an object came from, without the vertices that were deleted since."""
+    mesh = obj.data
+    stored = json.loads(mesh[TABLE])
+    properties = tuple(PlyProperty(*p) for p in stored["properties"])
+    header = tuple(stored["header"])
+    empty = PlyTable(header, stored["line_end"], stored["format"], properties, np.zeros(0, "V1"))
+    records = np.zeros(len(mesh.vertices), empty.dtype)
+    for prop in properties:
+        records[prop.name] = _load_raw(mesh, prop, records.dtype[prop.name].newbyteorder("="))
+    if stored["format"] == "ascii":
+        rows = np.empty(len(records), object)
+        rows[:] = ascii_rows(records)
+    else:
+        rows = records.view(f"V{records.dtype.itemsize}") if len(records) else np.zeros(0, f"V{records.dtype.itemsize}")
+    table = PlyTable(header, stored["line_end"], stored["format"], properties, rows)
+    return SplatFile(gaussians_of(table, obj.name), table)
+
+
+def _words(kind: np.dtype) -> int:
+    return -(-kind.itemsize // 4)
+
+
+def _store_raw(mesh: bpy.types.Mesh, prop: PlyProperty, column: np.ndarray) -> None:
+    """float32 as FLOAT; any other type as INT words of its bytes, as Blender has no doubles."""
+    if column.dtype == np.float32:
+        _attribute(mesh, RAW + prop.name, "FLOAT", "value", column)
+        return
+    words = np.zeros((len(column), 4 * _words(column.dtype)), np.uint8)
+    words[:, : column.dtype.itemsize] = np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1)
+    for k, word in enumerate(words.view(np.int32).T):
+        _attribute(mesh, f"{RAW}{prop.name}#{k}", "INT", "value", word)
+
+
+def _load_raw(mesh: bpy.types.Mesh, prop: PlyProperty, kind: np.dtype) -> np.ndarray:
+    names = [RAW + prop.name] if kind == np.float32 else [f"{RAW}{prop.name}#{k}" for k in range(_words(kind))]
+    if any(n not in mesh.attributes for n in names):
+        raise BadInput(f"{mesh.name} has lost its attribute {names[0]}; import the PLY again")
+    columns = np.empty((len(mesh.vertices), len(names)), np.float32 if kind == np.float32 else np.int32)
+    for k, name in enumerate(names):
+        column = np.empty(len(mesh.vertices), columns.dtype)
+        mesh.attributes[name].data.foreach_get("value", column)
+        columns[:, k] = column
+    if kind == np.float32:
+        return columns[:, 0]
+    return np.ascontiguousarray(columns.view(np.uint8)[:, : kind.itemsize]).view(kind)[:, 0]
+
+
+def _store_display(mesh: bpy.types.Mesh, gaussians: Gaussians, usable: np.ndarray) -> None:
+    scales = gaussians.scales
+    if gaussians.is_surfels:
+        scales = np.concatenate([scales, 1e-3 * scales.min(1, keepdims=True)], axis=1)
+    norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    quats = gaussians.quats / np.where(norms > 0, norms, 1)
+    encoded = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    hide = ~usable
+    shown = np.concatenate([linear, np.ones((len(linear), 1))], axis=1)
+    for name, kind, key, array in (
+        ("scale", "FLOAT_VECTOR", "vector", scales),
+        ("rotation", "QUATERNION", "value", quats),
+        ("opacity", "FLOAT", "value", gaussians.opacity),
+        ("color", "FLOAT_COLOR", "color", shown),
+    ):
+        clean = np.array(array, np.float32)
+        clean[hide] = 0
+        _attribute(mesh, name, kind, key, clean)
+
+
+def _attribute(mesh: bpy.types.Mesh, name: str, kind: str, key: str, array: np.ndarray) -> None:
+    attribute = mesh.attributes.new(name, kind, "POINT")
+    attribute.data.foreach_set(key, np.ascontiguousarray(array).ravel())
+
+
+def node_group() -> bpy.types.NodeTree:
+    """Geometry nodes that put an ellipsoid, or a point, on every splat; one group for all objects."""
+    if GROUP in bpy.data.node_groups:
+        return bpy.data.node_groups[GROUP]
+    tree = bpy.data.node_groups.new(GROUP, "GeometryNodeTree")
+    tree.is_modifier = True
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    points = tree.interface.new_socket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
+    points.description = "Show coloured points instead of ellipsoids: fast for millions of splats"
+    fraction = tree.interface.new_socket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
+    fraction.default_value, fraction.min_value, fraction.max_value = 1.0, 0.0, 1.0
+    fraction.description = "Share of the splats to show"
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    node, link = tree.nodes.new, tree.links.new
+    source, target = node("NodeGroupInput"), node("NodeGroupOutput")
+    lottery = node("FunctionNodeRandomValue")
+    lottery.data_type = "FLOAT"
+    chosen = node("FunctionNodeCompare")
+    chosen.data_type, chosen.operation = "FLOAT", "LESS_EQUAL"
+    link(lottery.outputs[1], chosen.inputs["A"])
+    link(source.outputs["Fraction"], chosen.inputs["B"])
+
+    ball = node("GeometryNodeMeshIcoSphere")
+    ball.inputs["Radius"].default_value, ball.inputs["Subdivisions"].default_value = 1.0, 2
+    painted = node("GeometryNodeSetMaterial")
+    painted.inputs["Material"].default_value = splat_material()
+    link(ball.outputs["Mesh"], painted.inputs["Geometry"])
+    instances = node("GeometryNodeInstanceOnPoints")
+    link(source.outputs["Geometry"], instances.inputs["Points"])
+    link(chosen.outputs["Result"], instances.inputs["Selection"])
+    link(painted.outputs["Geometry"], instances.inputs["Instance"])
+    link(_named(tree, "rotation", "QUATERNION"), instances.inputs["Rotation"])
+    extent = node("ShaderNodeVectorMath")
+    extent.operation = "SCALE"
+    extent.inputs["Scale"].default_value = EXTENT
+    link(_named(tree, "scale", "FLOAT_VECTOR"), extent.inputs[0])
+    link(extent.outputs[0], instances.inputs["Scale"])
+
+    dots = node("GeometryNodeMeshToPoints")
+    length = node("ShaderNodeVectorMath")
+    length.operation = "LENGTH"
+    link(_named(tree, "scale", "FLOAT_VECTOR"), length.inputs[0])
+    link(source.outputs["Geometry"], dots.inputs["Mesh"])
+    link(chosen.outputs["Result"], dots.inputs["Selection"])
+    link(length.outputs["Value"], dots.inputs["Radius"])
+    coloured = node("GeometryNodeSetMaterial")
+    coloured.inputs["Material"].default_value = splat_material()
+    link(dots.outputs["Points"], coloured.inputs["Geometry"])
+
+    choice = node("GeometryNodeSwitch")
+    choice.input_type = "GEOMETRY"
+    link(source.outputs["As Points"], choice.inputs["Switch"])
+    link(instances.outputs["Instances"], choice.inputs["False"])
+    link(coloured.outputs["Geometry"], choice.inputs["True"])
+    link(choice.outputs["Output"], target.inputs["Geometry"])
+    return tree
+
+
+def _socket(name: str) -> str:
+    return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
+
+
+def _named(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
+    node = tree.nodes.new("GeometryNodeInputNamedAttribute")
+    node.data_type = kind
+    node.inputs["Name"].default_value = name
+    return node.outputs["Attribute"]
+
+
+def splat_material() -> bpy.types.Material:
+    """Emission of the splat's colour with Gaussian falloff: opacity · exp(−d²/2), d the ray's distance from the centre."""
+    if MATERIAL in bpy.data.materials:
+        return bpy.data.materials[MATERIAL]
+    material = bpy.data.materials.new(MATERIAL)
+    material.use_nodes = True
+    material.surface_render_method = "BLENDED"
+    tree = material.node_tree
+    tree.nodes.clear()
+    node, link = tree.nodes.new, tree.links.new
+
+    def math(operation: str, a: object, b: object = None) -> bpy.types.NodeSocket:
+        step = node("ShaderNodeMath")
+        step.operation = operation
+        for socket, value in zip(step.inputs, (a, b)):
+            if isinstance(value, bpy.types.NodeSocket):
+                link(value, socket)
+            elif value is not None:
+                socket.default_value = value
+        return step.outputs[0]
+
+    def dot(a: bpy.types.NodeSocket, b: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        product = node("ShaderNodeVectorMath")
+        product.operation = "DOT_PRODUCT"
+        link(a, product.inputs[0])
+        link(b, product.inputs[1])
+        return product.outputs["Value"]
+
+    colour, opacity = (node("ShaderNodeAttribute") for _ in range(2))
+    for attribute, name in ((colour, "color"), (opacity, "opacity")):
+        attribute.attribute_type, attribute.attribute_name = "INSTANCER", name
+    geometry, place = node("ShaderNodeNewGeometry"), node("ShaderNodeTexCoord")
+    to_object, ray = node("ShaderNodeVectorTransform"), node("ShaderNodeVectorMath")
+    to_object.vector_type, to_object.convert_from, to_object.convert_to = "VECTOR", "WORLD", "OBJECT"
+    ray.operation = "NORMALIZE"
+    link(geometry.outputs["Incoming"], to_object.inputs[0])
+    link(to_object.outputs[0], ray.inputs[0])
+    along = dot(place.outputs["Object"], ray.outputs[0])
+    distance = math("SUBTRACT", dot(place.outputs["Object"], place.outputs["Object"]), math("MULTIPLY", along, along))
+    falloff = math("EXPONENT", math("MULTIPLY", distance, -0.5 * EXTENT**2))
+    front = math("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
+    alpha = math("MULTIPLY", math("MULTIPLY", falloff, opacity.outputs["Fac"]), front)
+    emission, clear, mix = node("ShaderNodeEmission"), node("ShaderNodeBsdfTransparent"), node("ShaderNodeMixShader")
+    out = node("ShaderNodeOutputMaterial")
+    link(colour.outputs["Color"], emission.inputs["Color"])
+    link(alpha, mix.inputs["Fac"])
+    link(clear.outputs[0], mix.inputs[1])
+    link(emission.outputs[0], mix.inputs[2])
+    link(mix.outputs[0], out.inputs["Surface"])
+    return material
+
+
+def default_name(path: Path) -> str:
+    return path.stem or "splats"
