@@ -16,6 +16,7 @@ from ..threads import parallel_map, thread_count
 from .project import (
     DEPTH,
     DRAWN,
+    FEATURES,
     HALF_HEIGHT,
     MEAN_X,
     MEAN_Y,
@@ -24,8 +25,10 @@ from .project import (
     WHITEN_XY,
     WHITEN_YY,
 )
+from .vec16 import prefetch
 
 RADIX_BITS = 11
+AHEAD = 16  # feature rows to prefetch: in depth order each is a cache miss
 ROWS_PER_CHUNK = 4096  # fewer Gaussians than this are not worth a thread
 
 
@@ -129,7 +132,9 @@ def _tile_columns(f, tile_y, across):
 # Not fast-math: both must come to the same tiles.
 @exact_kernel
 def _count(lo, hi, order, features, across, down, counts):
+    flat = features.reshape(-1)
     for k in range(lo, hi):
+        prefetch(flat, int64(order[min(k + AHEAD, hi - 1)]) * FEATURES)
         f = features[order[k]]
         y0, y1 = _tile_rows(f, down)
         for y in range(y0, y1):
@@ -140,7 +145,9 @@ def _count(lo, hi, order, features, across, down, counts):
 
 @exact_kernel
 def _scatter(lo, hi, order, features, across, down, places, entries):
+    flat = features.reshape(-1)
     for k in range(lo, hi):
+        prefetch(flat, int64(order[min(k + AHEAD, hi - 1)]) * FEATURES)
         f = features[order[k]]
         y0, y1 = _tile_rows(f, down)
         for y in range(y0, y1):
