@@ -1,7 +1,7 @@
 """Providers of appearance: what the reference looks like without the object (METHOD section 2).
 
-A provider is a function (image, hole, seed) → image. To add one: write it and name it in PROVIDERS, or, if it takes
-an argument after a colon, in `inpaint_reference`.
+A provider is a function (image, hole, seed) → Appearance. To add one: write it and name it in PROVIDERS or,
+if it takes an argument after a colon, in `_provider`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,24 @@ import numpy as np
 
 from ..errors import BadInput, IllPosed
 from ..io.images import read_image, write_png
-from ..solvers.patchmatch import (
-    PatchMatchSettings,
-    nearest_neighbour_field,
-    source_centres,
-    vote_range,
-)
-from ..threads import run_ranges
+from ..solvers.exemplar import ExemplarSettings, complete_picture
 
-TINY = 4  # px; smaller holes are interpolated
-MISMATCH = 24.0  # grey levels of median difference outside the hole from which a picture is of another view
-COARSEST = 40  # px, the exemplar pyramid's smallest side
-MAX_SHIFT = 0.02  # of the picture's width; a larger misalignment is not an edited copy of the view
+SPECK = 4  # px; smaller parts of a hole are interpolated
+HALO = 4  # px round the hole in which a picture is not compared with the view
+LEAST_COMPARED = 0.02  # share of the view that must lie outside the hole to judge a picture by
+GROSS = (
+    64.0  # grey levels; larger differences count as this much, so that a few changed objects do not decide
+)
+CLEARLY = 0.9  # registration is kept if it lowers the residual to this share, and by MARGIN
+MARGIN = 0.25  # grey levels
+MAX_SHIFT = 0.02  # of the picture's width; a picture that is off by more is not an edited copy of the view
+MAX_GAIN = 2.0
+# A picture is of another view if it differs by more than this many grey levels on average and its luminance
+# correlates less than this with the view's. Pictures of the same view with noise of 10 grey levels have 8 and
+# 0.99, photos from a few steps aside 12 to 30 and 0.1 to 0.85, other scenes over 30 and under 0.4.
+FOREIGN_DIFFERENCE = 12.0
+FOREIGN_CORRELATION = 0.8
+CONFIDENCE_SCALE = 20.0  # grey levels of residual at which the confidence has fallen to 1/e
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,9 @@ class Appearance:
     image: np.ndarray  # [H, W, 3] uint8; outside the hole it is the input, bit for bit
     confidence: float
     reason: str
+
+
+Provider = Callable[[np.ndarray, np.ndarray, int], Appearance]
 
 
 def inpaint_reference(
@@ -54,24 +63,117 @@ def inpaint_reference(
     BadInput
         If the provider is unknown, or its file or command fails.
     IllPosed
-        If the hole is the whole image.
+        If the hole is the whole image and no picture of it is given.
     """
+    provider = _provider(spec)
     if not hole.any():
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
+    if hole.all() and not spec.startswith("file:"):
+        raise IllPosed(
+            "appearance: the hole covers the whole reference; give a picture of it or choose another view"
+        )
+    filled = provider(image, hole, seed)
+    return Appearance(np.where(hole[..., None], filled.image, image), filled.confidence, filled.reason)
+
+
+def _provider(spec: str) -> Provider:
     name, _, argument = spec.partition(":")
+    if spec in PROVIDERS:
+        return lambda image, hole, seed: _without_specks(PROVIDERS[spec], image, hole, seed)
     if name == "file" and argument:
-        return paste_picture(image, hole, read_image(argument), argument)
-    if hole.all():
-        raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
+        return lambda image, hole, seed: paste_picture(image, hole, read_image(argument), argument)
     if name == "command" and argument:
-        return Appearance(*_composed(image, hole, _run_command(argument, image, hole)), f"filled by {argument.split()[0]}")
+        return lambda image, hole, seed: _run_command(argument, image, hole)
+    choices = f"{', '.join(PROVIDERS)}, file:PATH or command:CMD"
     if name == "onnx":
-        raise BadInput("--inpaint onnx: not in this version; use exemplar, telea, ns, shiftmap, file: or command:")
-    if spec not in PROVIDERS:
-        raise BadInput(f"--inpaint: unknown provider {spec!r}; use {', '.join(PROVIDERS)}, file:PATH or command:CMD")
-    if hole.sum() <= TINY:
-        return Appearance(*_composed(image, hole, telea(image, hole, seed)), "hole of a few pixels: interpolated")
-    return Appearance(*_composed(image, hole, PROVIDERS[spec](image, hole, seed)), f"filled by {spec}")
+        raise BadInput(f"--inpaint {spec}: model files are not in this version; use {choices}")
+    raise BadInput(f"--inpaint: unknown provider {spec!r}; use {choices}")
+
+
+def _without_specks(provider: Provider, image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+    """Parts of the hole of a few pixels are interpolated; the provider fills the rest."""
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
+    specks = hole & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
+    if specks.any():
+        rest = hole & ~specks
+        image = np.where(specks[..., None], telea(image, hole, seed).image, image)
+        if not rest.any():
+            return Appearance(image, 1.0, "a hole of a few pixels: interpolated")
+        hole = rest
+    return provider(image, hole, seed)
+
+
+def exemplar(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+    """Texture of the picture itself, from coarse to fine."""
+    done = complete_picture(image, hole, ExemplarSettings(seed=seed))
+    if np.isnan(done.misfit):
+        smooth = telea(image, hole, seed).image
+        return Appearance(smooth, 0.1, "no patch of the reference lies off the hole: interpolated")
+    confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    return Appearance(
+        done.image,
+        confidence,
+        f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels",
+    )
+
+
+def telea(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+    """Fast marching (Telea 2004), OpenCV."""
+    return Appearance(
+        cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA), 0.3, "interpolated by telea"
+    )
+
+
+def navier_stokes(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+    """Isophotes continued (Bertalmio 2001), OpenCV."""
+    return Appearance(cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_NS), 0.3, "interpolated by ns")
+
+
+def shiftmap(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+    """Shift maps (Pritch 2009), OpenCV's xphoto: it compares Lab colours; its mask marks what is known."""
+    if not hasattr(cv2, "xphoto"):
+        raise BadInput("--inpaint shiftmap needs OpenCV's contrib modules (opencv-contrib-python-headless)")
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2Lab)
+    filled = np.zeros_like(lab)
+    cv2.setRNGSeed(seed)
+    cv2.xphoto.inpaint(lab, (~hole).astype(np.uint8) * 255, filled, cv2.xphoto.INPAINT_SHIFTMAP)
+    return Appearance(cv2.cvtColor(filled, cv2.COLOR_Lab2RGB), 0.5, "filled by shiftmap")
+
+
+PROVIDERS: dict[str, Provider] = {
+    "exemplar": exemplar,
+    "telea": telea,
+    "ns": navier_stokes,
+    "shiftmap": shiftmap,
+}
+
+
+def _run_command(command: str, image: np.ndarray, hole: np.ndarray) -> Appearance:
+    """What a program makes of {image} and {mask} (255 = fill) in {out}; no shell is involved."""
+    if "{out}" not in command:
+        raise BadInput(
+            f"--inpaint command: {command!r} does not say where {{out}} goes; use {{image}} {{mask}} {{out}}"
+        )
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise BadInput(f"--inpaint command: cannot read {command!r} ({error})") from None
+    with tempfile.TemporaryDirectory(prefix="gimp3d-") as folder:
+        paths = {name: Path(folder) / f"{name}.png" for name in ("image", "mask", "out")}
+        write_png(paths["image"], image)
+        write_png(paths["mask"], hole)
+        for name, path in paths.items():
+            words = [word.replace(f"{{{name}}}", str(path)) for word in words]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+        except OSError as error:
+            raise BadInput(f"--inpaint command: cannot start {words[0]} ({error.strerror})") from None
+        if done.returncode != 0:
+            said = done.stderr.strip().splitlines()[-1:] or ["no message"]
+            raise BadInput(f"--inpaint command: {words[0]} ended with {done.returncode}: {said[0][:200]}")
+        if not paths["out"].exists():
+            raise BadInput(f"--inpaint command: {words[0]} wrote no {{out}} picture")
+        return paste_picture(image, hole, read_image(paths["out"]), f"the picture that {words[0]} wrote")
 
 
 def paste_picture(
@@ -80,195 +182,111 @@ def paste_picture(
     picture: np.ndarray,  # [H', W', 3] uint8, the view without the object
     name: str = "the picture",
 ) -> Appearance:
-    """A given picture, registered to the view (size, shift, gain) and pasted inside the hole only.
+    """A given picture, registered to the view (size, gain, shift) and pasted inside the hole only.
 
-    Shift and gain are applied only if they clearly lower the difference outside the hole.
+    Gain and shift are applied only if they clearly lower the difference outside the hole: a picture that
+    matches is pasted bit for bit.
 
     Raises
     ------
     BadInput
         If it has another shape or shows something else.
     """
-    h, w = hole.shape
-    if abs(picture.shape[1] * h - picture.shape[0] * w) > 1.5 * max(picture.shape[:2] + (h, w)):
-        raise BadInput(f"{name} has {picture.shape[1]}×{picture.shape[0]} pixels, which is not the shape of the view ({w}×{h})")
-    if picture.shape[:2] != (h, w):
-        way = cv2.INTER_AREA if picture.shape[0] > h else cv2.INTER_CUBIC
-        picture = cv2.resize(picture, (w, h), interpolation=way)
-    outside = cv2.dilate(hole.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
-    if outside.sum() < 0.02 * hole.size:
-        return Appearance(_paste(image, hole, picture), 0.5, "picture pasted; too little of the view is left to check it")
-    plain = _difference(image, picture, outside)
-    registered, words = _register(image, picture, outside)
-    residual = _difference(image, registered, outside)
-    if residual < 0.8 * plain - 0.25:
-        picture, plain = registered, residual
-    else:
-        words = "as it is"
-    if plain > MISMATCH:
-        raise BadInput(f"{name} does not show the reference view (median difference {plain:.0f} grey levels outside the hole)")
-    return Appearance(_paste(image, hole, picture), float(np.exp(-plain / 20)), f"picture pasted {words}, residual {plain:.1f} grey levels")
+    picture = _resized(picture, hole.shape, name)
+    size = 2 * HALO + 1
+    outside = cv2.dilate(hole.astype(np.uint8), np.ones((size, size), np.uint8)) == 0
+    if outside.mean() < LEAST_COMPARED:
+        pasted = np.where(hole[..., None], picture, image)
+        return Appearance(pasted, 0.5, "picture pasted; too little of the view is left to check it by")
+    picture, residual, words = _registered(image, picture, outside)
+    alike = _correlation(image, picture, outside)
+    if residual > FOREIGN_DIFFERENCE and alike < FOREIGN_CORRELATION:
+        raise BadInput(
+            f"{name} does not match the view: outside the hole it differs by {residual:.0f} grey levels on "
+            f"average and correlates by {alike:.2f}; give a picture of the reference view itself"
+        )
+    words = f"picture pasted {words}, residual {residual:.1f} grey levels"
+    return Appearance(
+        np.where(hole[..., None], picture, image), float(np.exp(-residual / CONFIDENCE_SCALE)), words
+    )
+
+
+def _resized(picture: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+    h, w = shape
+    height, width = picture.shape[:2]
+    if abs(width * h - height * w) > 1.5 * max(width, height, w, h):  # sizes are rounded to whole pixels
+        raise BadInput(f"{name} has {width}×{height} pixels, which is not the shape of the view ({w}×{h})")
+    if (height, width) == (h, w):
+        return picture
+    return cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA if height > h else cv2.INTER_CUBIC)
+
+
+def _registered(image: np.ndarray, picture: np.ndarray, outside: np.ndarray) -> tuple[np.ndarray, float, str]:
+    """The picture as it is, re-lit, or shifted and re-lit: the simplest that clearly fits better."""
+    best, residual, words = picture, _difference(image, picture, outside), "as it is"
+    dx, dy = _shift(image, picture, outside)
+    h, w = outside.shape
+    moved = cv2.warpAffine(
+        picture,
+        np.array([[1, 0, dx], [0, 1, dy]]),
+        (w, h),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    for candidate, how in ((picture, "with"), (moved, f"shifted by ({-dx:.1f}, {-dy:.1f}) px, with")):
+        gain = _gain(image, candidate, outside)
+        lit = np.clip(np.rint(candidate * gain), 0, 255).astype(np.uint8)
+        left = _difference(image, lit, outside)
+        if left < CLEARLY * residual - MARGIN:
+            best, residual, words = lit, left, f"{how} gain {gain.mean():.2f}"
+    return best, residual, words
 
 
 def _difference(image: np.ndarray, picture: np.ndarray, where: np.ndarray) -> float:
-    """Median over pixels of the mean absolute difference: a few changed objects do not count."""
-    return float(np.median(np.abs(image[where].astype(np.float32) - picture[where]).mean(-1)))
+    """Mean absolute difference in grey levels; gross ones are cut off."""
+    difference = np.abs(image[where].astype(np.float32) - picture[where]).mean(-1)
+    return float(np.minimum(difference, GROSS).mean())
 
 
-def _register(image: np.ndarray, picture: np.ndarray, outside: np.ndarray) -> tuple[np.ndarray, str]:
-    """The picture shifted and brightened to the view, by what lies outside the hole."""
+def _correlation(image: np.ndarray, picture: np.ndarray, where: np.ndarray) -> float:
+    """Of the two luminances, blurred against noise; 0 where one of them is constant."""
+    a, b = (cv2.GaussianBlur(_grey(p), (0, 0), 2)[where] for p in (image, picture))
+    spread = a.std() * b.std()
+    return float(((a - a.mean()) * (b - b.mean())).mean() / spread) if spread > 1e-6 else 0.0
+
+
+def _shift(image: np.ndarray, picture: np.ndarray, outside: np.ndarray) -> tuple[float, float]:
+    """(x, y) px where the view's origin lies in the picture, from coarse to fine; 0 if it cannot be told."""
     h, w = outside.shape
-    grey = [cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32) for p in (image, picture)]
     warp = np.eye(2, 3, dtype=np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
-    try:
-        _, warp = cv2.findTransformECC(
-            grey[0], grey[1], warp, cv2.MOTION_TRANSLATION, criteria, outside.astype(np.uint8) * 255, 5
-        )
-    except cv2.error:
-        warp = np.eye(2, 3, dtype=np.float32)  # no texture to align by
-    shift = warp[:, 2]
-    if np.abs(shift).max() > MAX_SHIFT * w:
-        shift = np.zeros(2, np.float32)
-    matrix = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
-    moved = cv2.warpAffine(
-        picture, matrix, (w, h), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
-    )
-    inside = moved[outside].astype(np.float32)
-    gain = np.median(image[outside].astype(np.float32), axis=0) / np.maximum(np.median(inside, axis=0), 1.0)
-    gain = np.clip(gain, 0.5, 2.0)
-    lit = np.clip(np.rint(moved * gain), 0, 255).astype(np.uint8)
-    words = f"after a shift of ({shift[0]:.1f}, {shift[1]:.1f}) px and gain {gain.mean():.2f}"
-    return lit, words
-
-
-def _paste(image: np.ndarray, hole: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    return np.where(hole[..., None], picture, image)
-
-
-def _composed(image: np.ndarray, hole: np.ndarray, filled: np.ndarray) -> tuple[np.ndarray, float]:
-    return _paste(image, hole, filled), 0.5
-
-
-def telea(image: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
-    """Fast marching (Telea 2004), OpenCV."""
-    return cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA)
-
-
-def navier_stokes(image: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
-    """Isophotes continued (Bertalmio 2001), OpenCV."""
-    return cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_NS)
-
-
-def shiftmap(image: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
-    """Shift maps (Pritch 2009), OpenCV's xphoto."""
-    if not hasattr(cv2, "xphoto"):
-        raise BadInput("--inpaint shiftmap needs OpenCV's contrib modules (opencv-contrib-python-headless)")
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2Lab)
-    filled = np.zeros_like(lab)
-    cv2.xphoto.inpaint(lab, (~hole).astype(np.uint8) * 255, filled, cv2.xphoto.INPAINT_SHIFTMAP)
-    return cv2.cvtColor(filled, cv2.COLOR_Lab2RGB)
-
-
-def exemplar(image: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
-    """Multi-scale exemplar completion: nearest-neighbour field and voting in turns (Wexler 2007, Barnes 2009)."""
-    settings = PatchMatchSettings(seed=seed, levels=1, coherence=0.0)
-    radius = settings.patch // 2
-    pyramid = [(image.astype(np.float32), hole)]
-    while min(pyramid[-1][1].shape) > COARSEST and _thickness(pyramid[-1][1]) > radius:
-        pyramid.append(_halved_outside(*pyramid[-1]))
-    filled: np.ndarray | None = None
-    for level in range(len(pyramid) - 1, -1, -1):
-        picture, open_ = pyramid[level]
-        if filled is None:
-            current = telea(_bytes(picture), open_, seed).astype(np.float32)
-        else:
-            up = cv2.resize(filled, (open_.shape[1], open_.shape[0]), interpolation=cv2.INTER_LINEAR)
-            current = np.where(open_[..., None], up, picture)
-        filled = _expectation_maximisation(picture, open_, current, radius, len(pyramid) - level, settings)
-    assert filled is not None
-    return _bytes(filled)
-
-
-def _expectation_maximisation(
-    picture: np.ndarray, hole: np.ndarray, current: np.ndarray, radius: int, rounds: int, settings: PatchMatchSettings
-) -> np.ndarray:
-    """Match the patches that touch the hole, let them vote for its pixels, and again; fewer rounds on fine levels."""
-    size = 2 * radius + 1
-    touching = cv2.dilate(hole.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-    if not source_centres(touching, ~hole, radius).any():
-        return current
-    depth_in_hole = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)
-    trust = (1.3 ** -np.minimum(depth_in_hole, 40)).astype(np.float32)  # the rim knows more than the middle
-    for _ in range(max(2, 12 - 3 * rounds + 3)):
-        field = nearest_neighbour_field(_bytes(current), touching, ~hole, None, settings)
-        sharpness = 1.0 / max(float(np.percentile(field.cost[touching], 75)), (1.0 / 255) ** 2)
-        voted = current.copy()
-        run_ranges(
-            vote_range,
-            hole.shape[0],
-            current,
-            hole,
-            field.rows,
-            field.cols,
-            field.cost,
-            trust,
-            np.float32(sharpness),
-            radius,
-            voted,
-        )
-        change = np.abs(voted[hole] - current[hole]).mean()
-        current = voted
-        if change < 0.3:
-            break
-    return current
-
-
-def _thickness(hole: np.ndarray) -> float:
-    return float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
-
-
-def _halved_outside(picture: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Half the resolution; hole pixels do not mix into their neighbours."""
-    size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
-    weight = (~hole).astype(np.float32)
-    total = cv2.resize(picture * weight[..., None], size, interpolation=cv2.INTER_AREA)
-    share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
-    return total / np.maximum(share, 1e-6)[..., None], share < 0.5
-
-
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-
-
-def _run_command(command: str, image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """What a program makes of {image} and {mask} in {out}; no shell is involved."""
-    with tempfile.TemporaryDirectory(prefix="gimp3d-") as folder:
-        paths = {k: str(Path(folder) / f"{k}.png") for k in ("image", "mask", "out")}
-        write_png(paths["image"], image)
-        write_png(paths["mask"], hole)
+    for factor in (4, 2, 1):
+        if min(h, w) < 32 * factor:
+            continue
+        size = (w // factor, h // factor)
+        view, other = (cv2.resize(_grey(p), size, interpolation=cv2.INTER_AREA) for p in (image, picture))
+        mask = cv2.resize(outside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        warp[:, 2] /= factor
         try:
-            words = [w.format(**paths) for w in shlex.split(command)]
-        except (ValueError, KeyError, IndexError) as error:
-            raise BadInput(f"--inpaint command: cannot read {command!r} ({error}); use {{image}} {{mask}} {{out}}") from None
-        try:
-            done = subprocess.run(words, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise BadInput(f"--inpaint command: cannot start {words[0]} ({error.strerror})") from None
-        if done.returncode != 0:
-            said = done.stderr.strip().splitlines()[-1:] or ["no message"]
-            raise BadInput(f"--inpaint command: {words[0]} ended with {done.returncode}: {said[0][:200]}")
-        if not Path(paths["out"]).exists():
-            raise BadInput(f"--inpaint command: {words[0]} wrote no {{out}} picture")
-        filled = read_image(paths["out"])
-    if filled.shape != image.shape:
-        raise BadInput(f"--inpaint command: the picture has shape {filled.shape[1]}×{filled.shape[0]}, not the view's")
-    return filled
+            warp = cv2.findTransformECC(view, other, warp, cv2.MOTION_TRANSLATION, criteria, mask, 5)[1]
+        except cv2.error:  # no texture, or nothing alike
+            return 0.0, 0.0
+        warp[:, 2] *= factor
+    if np.abs(warp[:, 2]).max() > MAX_SHIFT * w:
+        return 0.0, 0.0
+    return float(warp[0, 2]), float(warp[1, 2])
 
 
-PROVIDERS: dict[str, Callable[[np.ndarray, np.ndarray, int], np.ndarray]] = {
-    "exemplar": exemplar,
-    "telea": telea,
-    "ns": navier_stokes,
-    "shiftmap": shiftmap,
-}
+def _gain(image: np.ndarray, picture: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """[3] factor per channel that brings the picture to the view's exposure, from well exposed pixels."""
+    gain = np.ones(3)
+    for channel in range(3):
+        a, b = (p[..., channel][where].astype(np.float32) for p in (image, picture))
+        exposed = (a > 16) & (b > 16) & (a < 250) & (b < 250)
+        if exposed.any():
+            gain[channel] = np.median(a[exposed] / b[exposed])
+    return np.clip(gain, 1 / MAX_GAIN, MAX_GAIN)
+
+
+def _grey(picture: np.ndarray) -> np.ndarray:
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
