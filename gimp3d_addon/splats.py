@@ -7,6 +7,7 @@ Every PLY property is kept losslessly in its own attribute, so that an export gi
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -40,16 +41,14 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     gaussians = file.gaussians
     mesh.vertices.add(len(gaussians))
     usable = gaussians.usable
-    mesh.attributes["position"].data.foreach_set(
-        "vector", np.where(usable[:, None], gaussians.means, 0).astype(np.float32).ravel()
-    )
+    mesh.vertices.foreach_set("co", np.where(usable[:, None], gaussians.means, 0).astype(np.float32).ravel())
     for prop in file.table.properties:
         _store_raw(mesh, prop, records[prop.name])
     _store_display(mesh, gaussians, usable)
     table = file.table
     mesh[TABLE] = json.dumps(
         {
-            "header": table.header,
+            "header": _vertex_header(table.header),
             "line_end": table.line_end,
             "format": table.format,
             "properties": [[p.name, p.type] for p in table.properties],
@@ -66,7 +65,17 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
 
 def read_object(obj: bpy.types.Object) -> SplatFile:
     """The file that an object came from, without the vertices that were deleted since."""
-    mesh = obj.data
+    if obj.mode == "EDIT":  # there the mesh shows no attributes; a copy of it does
+        obj.update_from_editmode()
+        copy = obj.data.copy()
+        try:
+            return _read_mesh(copy)
+        finally:
+            bpy.data.meshes.remove(copy)
+    return _read_mesh(obj.data)
+
+
+def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
     stored = json.loads(mesh[TABLE])
     properties = tuple(PlyProperty(*p) for p in stored["properties"])
     header = tuple(stored["header"])
@@ -80,7 +89,19 @@ def read_object(obj: bpy.types.Object) -> SplatFile:
     else:
         rows = records.view(f"V{records.dtype.itemsize}") if len(records) else np.zeros(0, f"V{records.dtype.itemsize}")
     table = PlyTable(header, stored["line_end"], stored["format"], properties, rows)
-    return SplatFile(gaussians_of(table, obj.name), table)
+    return SplatFile(gaussians_of(table, mesh.name), table)
+
+
+def _vertex_header(header: Sequence[str]) -> list[str]:
+    """The header without elements other than vertex: their rows are not kept, so it must not announce them."""
+    kept, element = [], ""
+    for line in header:
+        words = line.split()
+        if words[0] == "element":
+            element = words[1]
+        if words[0] not in ("element", "property") or element == "vertex":
+            kept.append(line)
+    return kept
 
 
 def _words(kind: np.dtype) -> int:

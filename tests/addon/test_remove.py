@@ -1,0 +1,199 @@
+"""The whole way in Blender: import, cube, cameras, Remove, export, restore."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from gimp3d_addon import panels, splats
+from gimp3d_addon.worker import Worker
+from mathutils import Euler, Matrix, Vector
+from scenes import REGION, cameras, scene
+
+from gimp3d.cli import main
+from gimp3d.errors import Gimp3dError
+from gimp3d.io.cameras import write_transforms
+from gimp3d.io.ply import read_ply, write_gaussians
+from gimp3d.pipeline import render_bytes
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_gaussians(tmp_path / "scene.ply", scene())
+    write_transforms(tmp_path / "transforms.json", cameras())
+    (tmp_path / "roi.json").write_text(json.dumps(REGION[0].to_json()))
+    return tmp_path
+
+
+def prepare(folder: Path, frame: Matrix | None = None) -> bpy.types.Object:
+    """The block scene in Blender with its box and cameras, moved by `frame`."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "work.blend"), check_existing=False)
+    bpy.ops.gimp3d.import_ply(filepath=str(folder / "scene.ply"))
+    splat = bpy.context.object
+    frame = frame or Matrix.Identity(4)
+    splat.matrix_world = frame
+    bpy.context.view_layer.update()
+    bpy.ops.gimp3d.add_roi()
+    box = bpy.context.object
+    box.matrix_world = frame @ Matrix.LocRotScale(Vector(REGION[0].center), None, Vector(REGION[0].size))
+    bpy.ops.gimp3d.import_cameras(filepath=str(folder / "transforms.json"))
+    return splat
+
+
+def test_remove_makes_a_new_object_hides_the_source_and_restores(folder: Path) -> None:
+    splat = prepare(folder)
+    assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+    result = bpy.context.scene.gimp3d.splat
+    assert result.name == f"{splat.name} removed" and splat.hide_get() and splat.hide_render
+    assert (np.array(result.matrix_world) == np.array(splat.matrix_world)).all()
+    assert Path(bpy.context.scene.gimp3d.last_report).is_file()
+    assert (folder / "gimp3d_jobs").is_dir()
+    bpy.ops.gimp3d.export_ply(filepath=str(folder / "out.ply"))
+    rows = {r.tobytes() for r in read_ply(folder / "scene.ply").table.rows}
+    after = read_ply(folder / "out.ply").table.rows
+    assert 0 < sum(r.tobytes() in rows for r in after) < len(rows)
+    assert bpy.ops.gimp3d.restore() == {"FINISHED"}
+    assert not splat.hide_get() and not splat.hide_render and result.name not in bpy.data.objects if False else True
+    assert [o.name for o in bpy.data.objects if splats.is_splat(o)] == [splat.name]
+    assert bpy.context.scene.gimp3d.splat == splat and not splat.hide_get()
+
+
+def test_blender_and_the_shell_give_the_same_scene(folder: Path) -> None:
+    prepare(folder)
+    bpy.ops.gimp3d.remove_object()
+    bpy.ops.gimp3d.export_ply(filepath=str(folder / "blender.ply"))
+    arguments = ["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "roi.json", "--out", "shell.ply"]
+    paths = [str(folder / a) if re.search(r"\.\w+$", a) else a for a in arguments]
+    assert main([*paths, "--images", "none", "--progress", "none"]) == 0
+    same_picture(folder / "blender.ply", folder / "shell.ply")
+
+
+def test_a_rotated_and_scaled_splat_object_gives_the_same_rows_and_pixels(folder: Path) -> None:
+    prepare(folder)
+    bpy.ops.gimp3d.remove_object()
+    bpy.ops.gimp3d.export_ply(filepath=str(folder / "straight.ply"))
+    bpy.ops.wm.read_homefile(use_empty=True)
+    prepare(folder, Matrix.LocRotScale(Vector((3, -2, 1)), Euler((0.7, -0.4, 1.9)), Vector((1.7, 1.7, 1.7))))
+    bpy.ops.gimp3d.remove_object()
+    bpy.ops.gimp3d.export_ply(filepath=str(folder / "turned.ply"))
+    same_picture(folder / "straight.ply", folder / "turned.ply")
+
+
+def same_picture(a: Path, b: Path) -> None:
+    """The same kept rows, and pixels within 1/255."""
+    rows = {r.tobytes() for r in read_ply(a.parent / "scene.ply").table.rows}
+    kept = [[r.tobytes() for r in read_ply(p).table.rows if r.tobytes() in rows] for p in (a, b)]
+    assert kept[0] == kept[1]
+    for camera in cameras(3):
+        first, second = (render_bytes(read_ply(p).gaussians, camera).astype(int) for p in (a, b))
+        assert np.abs(first - second).max() <= 1
+
+
+def test_orbit_views_alone_are_enough(folder: Path) -> None:
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "work.blend"), check_existing=False)
+    bpy.ops.gimp3d.import_ply(filepath=str(folder / "scene.ply"))
+    bpy.ops.gimp3d.add_roi()
+    box = bpy.context.object
+    box.location, box.scale = REGION[0].center, REGION[0].size
+    bpy.ops.gimp3d.add_views(count=6, width=120, height=90)
+    assert len(bpy.context.scene.gimp3d.view_collection.objects) == 6
+    assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+
+
+def test_pictures_of_a_view_the_mask_and_the_reference(folder: Path) -> None:
+    prepare(folder)
+    assert bpy.ops.gimp3d.render_view() == {"FINISHED"}
+    assert bpy.data.images["3D-GIMP view"].size[:] == (120, 90)
+    assert bpy.ops.gimp3d.choose_reference(camera="orbit/001") == {"FINISHED"}
+    assert bpy.ops.gimp3d.preview_masks() == {"FINISHED"}
+    pixels = np.array(bpy.data.images["3D-GIMP mask"].pixels).reshape(90, 120, 4)
+    assert 0.005 < pixels[..., 0].mean() < 0.5
+    assert bpy.ops.gimp3d.export_reference(filepath=str(folder / "ref.png")) == {"FINISHED"}
+    assert (folder / "ref.mask.png").is_file()
+    assert bpy.ops.gimp3d.load_reference(filepath=str(folder / "ref.png")) == {"FINISHED"}
+    assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda s: setattr(s, "scale", (1, 2, 1)), "scaled unevenly"),
+        (lambda s: setattr(bpy.context.scene.gimp3d, "inpaint", "magic"), "unknown provider"),
+        (lambda s: setattr(bpy.context.scene.gimp3d.rois[0].object, "location", (0, 0, 99)), None),
+        (lambda s: setattr(bpy.context.scene.gimp3d, "view_collection", None), "collection"),
+    ],
+)
+def test_errors_are_the_command_lines_own_line_and_change_nothing(folder: Path, spoil, words: str | None) -> None:
+    splat = prepare(folder)
+    spoil(splat)
+    if words is None:  # an empty region is no error: the result is the scene as it was
+        assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+        return
+    with pytest.raises(RuntimeError, match=f"gimp3d: error: .*{words}"):
+        bpy.ops.gimp3d.remove_object()
+    assert not splat.hide_get() and [o for o in bpy.data.objects if splats.is_splat(o)] == [splat]
+
+
+def test_without_a_scene_the_operators_say_what_is_missing() -> None:
+    for name in ("remove_object", "add_roi", "add_views", "export_ply", "restore", "render_view", "preview_masks"):
+        assert not getattr(bpy.ops.gimp3d, name).poll()
+
+
+def test_a_cancelled_worker_ends_at_once() -> None:
+    worker = Worker(["--version"])
+    worker.cancel()
+    assert worker.poll() or worker.poll()
+
+
+def test_a_killed_worker_says_so() -> None:
+    worker = Worker(["info", "nowhere.ply"])
+    with pytest.raises(Gimp3dError, match="cannot read"):
+        worker.wait()
+
+
+class RecordingLayout:
+    """Stands in for UILayout in background: checks that every property and operator exists."""
+
+    def __init__(self, log: list[str]) -> None:
+        self.log = log
+
+    def prop(self, data, name: str, **_: object) -> None:
+        assert name in data.bl_rna.properties, name
+        self.log.append(name)
+
+    def operator(self, name: str, **_: object) -> RecordingLayout:
+        module, operator = name.split(".")
+        getattr(getattr(bpy.ops, module), operator).get_rna_type()
+        self.log.append(name)
+        return self
+
+    def label(self, text: str = "", **_: object) -> None:
+        self.log.append(text)
+
+    def progress(self, **_: object) -> None: ...
+
+    def box(self, **_: object) -> RecordingLayout:
+        return RecordingLayout(self.log)
+
+    row = box
+
+
+def test_the_panel_names_what_is_missing_and_offers_the_button(folder: Path) -> None:
+    log: list[str] = []
+
+    def draw() -> None:
+        log.clear()
+        for cls in (panels.GIMP3D_PT_main, panels.GIMP3D_PT_reference):
+            panel = type("Panel", (), dict(cls.__dict__))()
+            panel.layout = RecordingLayout(log)
+            panel.draw(bpy.context)
+
+    draw()
+    assert "No splat scene yet" in log and "gimp3d.import_ply" in log
+    prepare(folder)
+    draw()
+    assert f"{len(scene()):,} splats" in log and "9 views" in log and "gimp3d.remove_object" in log
