@@ -233,7 +233,8 @@ def splat_material() -> bpy.types.Material:
     if MATERIAL in bpy.data.materials:
         return bpy.data.materials[MATERIAL]
     material = bpy.data.materials.new(MATERIAL)
-    material.use_nodes = True
+    if material.node_tree is None:  # Blender < 5.0
+        material.use_nodes = True
     material.surface_render_method = "BLENDED"
     tree = material.node_tree
     tree.nodes.clear()

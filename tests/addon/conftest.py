@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="gimp3d-blender-")  # before bpy is imported
@@ -15,6 +16,9 @@ bpy = pytest.importorskip("bpy", reason="the bpy module is not installed (make s
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import gimp3d_addon
+
+from gimp3d.gaussians import Gaussians
+from gimp3d.io.ply import write_gaussians
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,3 +35,28 @@ def empty_blender() -> Iterator[None]:
     bpy.ops.wm.read_homefile(use_empty=True)
     yield
     bpy.ops.wm.read_homefile(use_empty=True)
+
+
+@pytest.fixture(scope="session")
+def few_gaussians() -> Gaussians:
+    """50 random Gaussians of SH degree 3."""
+    rng = np.random.default_rng(3)
+    return Gaussians(
+        means=rng.normal(size=(50, 3)).astype(np.float32),
+        log_scales=rng.normal(-3, 1, (50, 3)).astype(np.float32),
+        quats=rng.normal(size=(50, 4)).astype(np.float32),
+        opacity_logits=rng.normal(size=50).astype(np.float32),
+        sh=rng.normal(size=(50, 16, 3)).astype(np.float32),
+    )
+
+
+@pytest.fixture
+def import_scene(tmp_path: Path) -> Callable[[Gaussians], bpy.types.Object]:
+    """Writes Gaussians to a PLY and imports it; returns the object."""
+
+    def load(gaussians: Gaussians) -> bpy.types.Object:
+        write_gaussians(tmp_path / "scene.ply", gaussians)
+        bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "scene.ply"))
+        return bpy.context.object
+
+    return load

@@ -1,0 +1,89 @@
+"""The zip that users install: built by Blender's builder, installed and enabled from the zip, and run there."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import REGION, scene
+
+from gimp3d.io.ply import read_ply, write_gaussians
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = """
+import json, os, sys
+import bpy
+zip_path, folder = sys.argv[1:]
+bpy.ops.extensions.package_install_files(
+    filepath=zip_path, repo="user_default", enable_on_install=True, overwrite=True)
+assert "bl_ext.user_default.gimp3d" in bpy.context.preferences.addons
+import gimp3d
+print("core from", gimp3d.__file__)
+bpy.ops.wm.read_homefile(use_empty=True)
+bpy.ops.wm.save_as_mainfile(filepath=folder + "/work.blend", check_existing=False)
+bpy.ops.gimp3d.import_ply(filepath=folder + "/scene.ply")
+bpy.ops.gimp3d.add_roi()
+region = json.load(open(folder + "/roi.json"))
+bpy.context.object.location, bpy.context.object.scale = region["center"], region["size"]
+bpy.ops.gimp3d.add_views(count=6, width=120, height=90)
+assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+bpy.ops.gimp3d.export_ply(filepath=folder + "/out.ply")
+bpy.ops.preferences.addon_disable(module="bl_ext.user_default.gimp3d")
+assert not hasattr(bpy.context.scene, "gimp3d")
+print("done")
+"""
+
+
+def install_and_run(zip_path: Path, folder: Path, python: Path, environment: dict[str, str]) -> str:
+    write_gaussians(folder / "scene.ply", scene())
+    (folder / "roi.json").write_text(json.dumps(REGION[0].to_json()))
+    (folder / "script.py").write_text(SCRIPT)
+    done = subprocess.run(
+        [str(python), str(folder / "script.py"), str(zip_path), str(folder)],
+        env={**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user"), **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0 and "done" in done.stdout, done.stdout + done.stderr
+    rows = {r.tobytes() for r in read_ply(folder / "scene.ply").table.rows}
+    out = read_ply(folder / "out.ply").table.rows
+    kept = np.array([r.tobytes() in rows for r in out])
+    assert kept.any() and not kept.all()
+    return done.stdout
+
+
+def build(*arguments: str) -> Path:
+    subprocess.run([sys.executable, str(ROOT / "scripts" / "build_extension.py"), *arguments], check=True)
+    return max((ROOT / "dist").glob("gimp3d-*.zip"), key=lambda p: p.stat().st_mtime)
+
+
+def test_the_light_zip_installs_enables_and_removes(tmp_path: Path) -> None:
+    zip_path = build("--without-compiled-wheels")
+    names = zipfile.ZipFile(zip_path).namelist()
+    assert {"blender_manifest.toml", "__init__.py", "gimp3d_addon/bridge.py"} <= set(names)
+    assert not [n for n in names if "numpy" in n or "__pycache__" in n or "tests" in n]
+    install_and_run(zip_path, tmp_path, Path(sys.executable), {})
+
+
+@pytest.mark.slow
+def test_the_full_zip_carries_all_that_the_core_needs(tmp_path: Path) -> None:
+    """In an environment with only bpy and its own requirements, as a fresh Blender: the wheels come from the zip."""
+    zip_path = build()
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "env")], check=True)
+    python = tmp_path / "env" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    site = Path(np.__file__).resolve().parents[1]
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("bpy", "numpy", "numpy.libs", "requests", "urllib3", "certifi", "idna", "charset_normalizer", "zstandard", "cython"):
+        if (site / name).exists():
+            (bare / name).symlink_to(site / name)
+    environment = {"PYTHONPATH": str(bare), "GIMP3D_CACHE": str(tmp_path / "cache")}
+    said = install_and_run(zip_path, tmp_path, python, environment)
+    assert str(tmp_path / "user") in said.split("core from", 1)[1].splitlines()[0]

@@ -1,0 +1,271 @@
+"""The contract of the command line: results, exit codes, and that nothing half-written stays."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import REGION, cameras, scene, truth
+
+from gimp3d.cli import main
+from gimp3d.commands import output_name
+from gimp3d.io.cameras import write_transforms
+from gimp3d.io.images import read_image, write_png
+from gimp3d.io.ply import read_ply, write_gaussians
+from gimp3d.pipeline import render_bytes
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """scene.ply, transforms.json, roi.json and photos of the block scene."""
+    folder = tmp_path_factory.mktemp("scene")
+    write_gaussians(folder / "scene.ply", scene(), ["made by the tests"])
+    views = cameras()
+    write_transforms(folder / "transforms.json", views)
+    (folder / "roi.json").write_text(json.dumps(REGION[0].to_json()))
+    for camera in views:
+        write_png(folder / f"{camera.id}.png", render_bytes(scene(), camera))
+    return folder
+
+
+def remove(folder: Path, out: Path, *more: str, expect: int = 0) -> None:
+    arguments = ["remove", folder / "scene.ply", "--cameras", folder / "transforms.json", "--roi", folder / "roi.json"]
+    assert main([*map(str, arguments), "--out", str(out), "--progress", "none", *more]) == expect
+
+
+def test_remove_keeps_rows_byte_for_byte_and_fills_the_hole(scene_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.ply"
+    remove(scene_folder, out, "--summary", str(tmp_path / "s.json"), "--report", str(tmp_path / "report"))
+    before, after = read_ply(scene_folder / "scene.ply"), read_ply(out)
+    summary = json.loads((tmp_path / "s.json").read_text())
+    counts = summary["counts"]
+    kept = counts["gaussians_in"] - counts["removed"]
+    rows = {r.tobytes() for r in before.table.rows}
+    assert all(r.tobytes() in rows for r in after.table.rows[:kept])
+    assert counts["gaussians_out"] == len(after.gaussians) == kept + counts["added"]
+    assert after.table.comments == before.table.comments
+    assert np.isfinite(after.gaussians.means).all()
+    assert (tmp_path / "report" / "index.html").read_text().startswith("<!doctype html>")
+    for camera in cameras(4):
+        filled, true = (render_bytes(g, camera).astype(float) for g in (after.gaussians, truth()))
+        opened = render_bytes(after.gaussians.take(np.arange(kept)), camera)
+        error = ((filled - true) ** 2).mean()
+        assert 10 * np.log10(255**2 / error) > 36, camera.id
+        assert error < 0.1 * ((opened - true) ** 2).mean()
+    assert set(summary) >= {"version", "command", "seconds_total", "stages", "counts", "settings", "warnings", "peak_memory_mb"}
+    assert {"name", "seconds", "confidence", "reason"} <= set(summary["stages"][0])
+
+
+def test_result_does_not_depend_on_the_number_of_threads(scene_folder: Path, tmp_path: Path) -> None:
+    outs = [tmp_path / f"{n}.ply" for n in (1, 3)]
+    for threads, out in zip(("1", "3"), outs):
+        remove(scene_folder, out, "--threads", threads)
+    assert outs[0].read_bytes() == outs[1].read_bytes()
+
+
+def test_running_again_on_the_result_works(scene_folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(scene_folder, again)
+    remove(scene_folder, tmp_path / "out.ply")
+    shutil.copy2(tmp_path / "out.ply", again / "scene.ply")
+    remove(again, tmp_path / "twice.ply", "--images", "none")
+    assert len(read_ply(tmp_path / "twice.ply").gaussians) > 0
+
+
+def test_an_empty_region_changes_no_byte_and_warns(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    roi = tmp_path / "roi.json"
+    roi.write_text('{"center": [0, 0, 50], "size": [1, 1, 1]}')
+    out = tmp_path / "out.ply"
+    scene_, cams = scene_folder / "scene.ply", scene_folder / "transforms.json"
+    arguments = ["remove", str(scene_), "--cameras", str(cams), "--roi", str(roi), "--out", str(out)]
+    assert main([*arguments, "--progress", "none"]) == 0
+    assert out.read_bytes() == scene_.read_bytes()
+    assert "nothing to remove" in capsys.readouterr().err
+
+
+def test_json_progress_ends_with_the_summary(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    remove(scene_folder, tmp_path / "out.ply", "--progress", "json")
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert all({"stage", "done", "total", "message"} <= set(line) for line in lines[:-1])
+    assert {"masks", "depth", "mapping", "propagate", "seed"} <= {line["stage"] for line in lines}
+    assert lines[-1]["stage"] == "done" and lines[-1]["summary"]["counts"]["removed"] > 0
+
+
+def test_a_job_runs_alone_moves_and_resumes(scene_folder: Path, tmp_path: Path) -> None:
+    job = tmp_path / "job"
+    shutil.copytree(scene_folder, job)
+    remove(job, job / "out.ply", "--job", str(job))
+    first = (job / "out.ply").read_bytes()
+    (job / "out.ply").unlink()
+    moved = tmp_path / "moved"
+    job.rename(moved)
+    assert main(["remove", "--job", str(moved), "--resume", "--progress", "none"]) == 0
+    assert (moved / "out.ply").read_bytes() == first
+    summary = json.loads((moved / "summary.json").read_text())
+    assert sum(s["seconds"] for s in summary["stages"]) < 5
+
+
+def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -> None:
+    reference = cameras()[0]
+    write_png(tmp_path / "true.png", render_bytes(truth(), reference))
+    out = tmp_path / "out.ply"
+    given = ("--reference", reference.id, "--reference-image", str(tmp_path / "true.png"))
+    remove(scene_folder, out, *given, "--views-out", str(tmp_path / "views"))
+    assert (read_image(tmp_path / "views" / f"{reference.id}.png").shape) == (90, 120, 3)
+
+
+def test_render_masks_orbit_evaluate_and_info(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene_, cams, roi = (str(scene_folder / n) for n in ("scene.ply", "transforms.json", "roi.json"))
+    quiet = ["--progress", "none"]
+    draw = ["render", scene_, "--cameras", cams, "--out", str(tmp_path / "r"), "--frames", "orbit/000,orbit/001"]
+    assert main([*draw, "--passes", "rgb,alpha,depth,normal", "--scale", "0.5", *quiet]) == 0
+    made = {p.relative_to(tmp_path / "r").as_posix() for p in (tmp_path / "r").rglob("*.*")}
+    assert made == {
+        f"orbit/00{k}{e}" for k in (0, 1) for e in (".png", ".alpha.png", ".depth.npy", ".normal.npy")
+    }
+    depth = np.load(tmp_path / "r" / "orbit" / "000.depth.npy")
+    assert depth.shape == (45, 60) and depth.dtype == np.float32 and depth.max() > 0
+    for mode in ("need", "paper"):
+        assert main(["masks", scene_, "--cameras", cams, "--roi", roi, "--out", str(tmp_path / mode), "--mode", mode, *quiet]) == 0
+        mask = read_image(tmp_path / mode / "orbit" / "000.png")
+        assert set(np.unique(mask)) == {0, 255}
+    assert main(["orbit", scene_, "--roi", roi, "--out", str(tmp_path / "c.json"), "--views", "5", "--size", "64x48"]) == 0
+    assert len(json.loads((tmp_path / "c.json").read_text())["frames"]) == 5
+    assert main(["render", scene_, "--cameras", cams, "--out", str(tmp_path / "t"), *quiet]) == 0
+    capsys.readouterr()
+    score = ["evaluate", "--pred", str(tmp_path / "t"), "--truth", str(tmp_path / "t"), "--masks", str(tmp_path / "need")]
+    assert main([*score, "--exclude", "orbit/003.png", "--json", str(tmp_path / "e.json")]) == 0
+    scores = json.loads((tmp_path / "e.json").read_text())
+    assert len(scores["views"]) == 8 and scores["mean"]["ssim"] == pytest.approx(1) and scores["mean"]["flip"] < 1e-6
+    capsys.readouterr()
+    assert main(["info", scene_, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["gaussians"] == len(scene())
+
+
+BAD = {
+    "missing scene": (["info", "nowhere.ply"], 2, "cannot read"),
+    "mesh": (["info", "mesh.ply"], 2, "not a Gaussian scene"),
+    "compressed": (["info", "compressed.ply"], 2, "compressed"),
+    "truncated": (["info", "truncated.ply"], 2, "truncated"),
+    "absurd count": (["info", "absurd.ply"], 2, "truncated"),
+    "no end of header": (["info", "endless.ply"], 2, "end_header"),
+    "not a PLY": (["info", "roi.json"], 2, "not a PLY"),
+    "no command": ([], 2, "required"),
+    "unknown command": (["fill"], 2, "invalid choice"),
+    "missing options": (["remove", "scene.ply"], 2, "remove needs"),
+    "roi not JSON": (["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "scene.ply"], 2, "ROI"),
+    "roi missing": (["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "no.json"], 2, "ROI"),
+    "roi flat": (["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "flat.json"], 2, "positive"),
+    "everything selected": (["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "all.json"], 3, "whole scene"),
+    "no view sees it": (["remove", "scene.ply", "--cameras", "away.json", "--roi", "roi.json"], 3, "no usable view"),
+    "cameras not JSON": (["remove", "scene.ply", "--cameras", "mesh.ply", "--roi", "roi.json"], 2, "not JSON"),
+    "cameras of another kind": (["remove", "scene.ply", "--cameras", "roi.json", "--roi", "roi.json"], 2, "no cameras"),
+    "fisheye": (["remove", "scene.ply", "--cameras", "fisheye.json", "--roi", "roi.json"], 2, "fisheye"),
+    "panoramic": (["remove", "scene.ply", "--cameras", "pano.json", "--roi", "roi.json"], 2, "panoramic"),
+    "orthographic": (["remove", "scene.ply", "--cameras", "ortho.json", "--roi", "roi.json"], 2, "orthographic"),
+    "climbing ID": (["remove", "scene.ply", "--cameras", "climb.json", "--roi", "roi.json"], 2, "leads out"),
+    "unknown reference": (["remove", *"scene.ply --cameras transforms.json --roi roi.json --reference x".split()], 2, "no camera x"),
+    "picture of another view": (
+        [*"remove scene.ply --cameras transforms.json --roi roi.json --reference orbit/000".split(), "--reference-image", "noise.png"], 2, "does not show",
+    ),
+    "picture of another shape": (
+        [*"remove scene.ply --cameras transforms.json --roi roi.json --reference orbit/000".split(), "--reference-image", "square.png"], 2, "shape",
+    ),
+    "picture without its view": (
+        [*"remove scene.ply --cameras transforms.json --roi roi.json --reference-image noise.png".split()], 2, "--reference",
+    ),
+    "unknown provider": ([*"remove scene.ply --cameras transforms.json --roi roi.json --inpaint magic".split()], 2, "unknown provider"),
+    "unknown prior": ([*"remove scene.ply --cameras transforms.json --roi roi.json --depth-prior magic".split()], 2, "unknown provider"),
+    "failing command": (
+        [*"remove scene.ply --cameras transforms.json --roi roi.json --set use_evidence=false --inpaint".split(), "command:false"], 2, "ended with 1",
+    ),
+    "unknown setting": ([*"remove scene.ply --cameras transforms.json --roi roi.json --set a.b=1".split()], 2, "no setting"),
+    "setting of a wrong type": (
+        [*"remove scene.ply --cameras transforms.json --roi roi.json --set seed.opacity=much".split()], 2, "takes a float",
+    ),
+    "no CUDA": ([*"remove scene.ply --cameras transforms.json --roi roi.json --device cuda".split()], 2, "CUDA"),
+    "no job there": (["remove", "--job", "nowhere"], 2, "job.json"),
+    "no threads": ([*"render scene.ply --cameras transforms.json --out r --threads 0".split()], 2, "--threads"),
+    "unknown pass": ([*"render scene.ply --cameras transforms.json --out r --passes rgb,smell".split()], 2, "unknown pass"),
+    "unknown frame": ([*"render scene.ply --cameras transforms.json --out r --frames nobody".split()], 2, "no camera nobody"),
+    "up is zero": ([*"orbit scene.ply --roi roi.json --out c.json --up 0,0,0".split()], 2, "up direction"),
+    "nothing to score": ([*"evaluate --pred a --truth b --masks c".split()], 2, "not a folder"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bad_folder(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bad")
+    for name in ("scene.ply", "transforms.json", "roi.json"):
+        shutil.copy2(scene_folder / name, folder)
+    whole = (folder / "scene.ply").read_bytes()
+    (folder / "truncated.ply").write_bytes(whole[: len(whole) // 2])
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float f_dc_0\n"
+    (folder / "absurd.ply").write_text(head.format(10**17) + "end_header\n")
+    (folder / "endless.ply").write_text(head.format(1))
+    (folder / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    (folder / "compressed.ply").write_text(
+        "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+        "property uint packed_position\nend_header\n"
+    )
+    (folder / "flat.json").write_text('{"center": [0,0,0], "size": [1,0,1]}')
+    (folder / "all.json").write_text('{"center": [0,0,0], "size": [99,99,99]}')
+    document = json.loads((folder / "transforms.json").read_text())
+    for name, model in (("fisheye", "OPENCV_FISHEYE"), ("pano", "EQUIRECTANGULAR"), ("ortho", "ORTHOGRAPHIC")):
+        (folder / f"{name}.json").write_text(json.dumps({**document, "camera_model": model}))
+    climbing = [{**f, "file_path": "../" + f["file_path"]} for f in document["frames"]]
+    (folder / "climb.json").write_text(json.dumps({**document, "frames": climbing}))
+    turned = [dict(f) for f in document["frames"]]
+    for frame in turned:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1, 1, -1, 1])).tolist()
+    (folder / "away.json").write_text(json.dumps({**document, "frames": turned}))
+    noise = np.random.default_rng(0).integers(0, 255, (90, 120, 3), dtype=np.uint8)
+    write_png(folder / "noise.png", noise)
+    write_png(folder / "square.png", noise[:, :90])
+    return folder
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_gives_one_line_the_right_code_and_no_output(
+    name: str, bad_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments, code, words = BAD[name]
+    monkeypatch.chdir(bad_folder)
+    before = {p for p in bad_folder.rglob("*")}
+    if arguments[:1] == ["remove"] and "--roi" in arguments:
+        arguments = [*arguments, "--out", "out.ply", "--progress", "none"]
+    assert main(arguments) == code
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and said[0].startswith("gimp3d: error: ") and words in said[0], said
+    assert {p for p in bad_folder.rglob("*")} == before
+
+
+def test_an_output_that_cannot_be_written_is_one_line(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("in the way")
+    remove(scene_folder, tmp_path / "file" / "out.ply", expect=2)
+    assert "cannot write" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_ends_with_130_and_leaves_nothing(scene_folder: Path, tmp_path: Path) -> None:
+    code = (
+        "import gimp3d.cli as c, gimp3d.commands as k\n"
+        "def stop(*a, **b): raise KeyboardInterrupt\n"
+        "k.remove_object = stop\n"
+        "import sys; sys.exit(c.main(sys.argv[1:]))"
+    )
+    arguments = ["remove", scene_folder / "scene.ply", "--cameras", scene_folder / "transforms.json"]
+    arguments += ["--roi", scene_folder / "roi.json", "--out", tmp_path / "out.ply", "--progress", "none"]
+    done = subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 130 and done.stderr.startswith("gimp3d: error: interrupted")
+    assert not list(tmp_path.iterdir())
+
+
+def test_output_names_drop_the_extension_only() -> None:
+    assert output_name("images/000.png") == "images/000"
+    assert output_name("a.b/c") == "a.b/c"
+    assert output_name("photo.v2.jpg") == "photo.v2"
