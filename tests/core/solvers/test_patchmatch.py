@@ -5,6 +5,9 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from gimp3d.solvers.patchmatch import (
     NearestNeighbourField,
     PatchMatchSettings,
@@ -13,8 +16,6 @@ from gimp3d.solvers.patchmatch import (
     upsampled,
 )
 from gimp3d.threads import set_thread_count
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 APPEARANCE_ONLY = PatchMatchSettings(coherence=0.0)
 
@@ -119,10 +120,10 @@ def test_coherence_makes_the_field_smoother() -> None:
     image, target = cv2.GaussianBlur(texture(80, 120), (0, 0), 2), disc(80, 120, 18)
     none, paper, strong = (
         incoherence(nearest_neighbour_field(image, target, ~target, None, PatchMatchSettings(coherence=c)))
-        for c in (0.0, 0.001, 0.02)
+        for c in (0.0, 0.001, 0.01)
     )
     assert paper < 0.8 * none
-    assert strong < 0.8 * paper
+    assert strong < 0.6 * paper
 
 
 @pytest.mark.parametrize(("coherence", "most"), [(0.0, 1.5), (0.001, 3.0)])
@@ -165,7 +166,9 @@ def test_an_empty_target_gives_an_empty_field() -> None:
 def test_upsampling_doubles_coordinates_and_keeps_parity() -> None:
     rows, cols = np.full((2, 3, 4), -1, np.int32)
     rows[1, 1], cols[1, 1] = 2, 3
-    fine = upsampled(NearestNeighbourField(rows, cols, np.zeros((3, 4), np.float32), 2), np.ones((6, 7), bool))
+    fine = upsampled(
+        NearestNeighbourField(rows, cols, np.zeros((3, 4), np.float32), 2), np.ones((6, 7), bool)
+    )
     assert fine.found.sum() == 4
     assert fine.rows[2:4, 2:4].tolist() == [[4, 4], [5, 5]]
     assert fine.cols[2:4, 2:4].tolist() == [[6, 6], [6, 6]]  # the seventh column is the last one
