@@ -7,8 +7,10 @@ move. A uniform scale of the object changes depths, not pictures.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
 
 import bpy
 import numpy as np
@@ -20,6 +22,11 @@ from mathutils import Matrix
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
 SENSOR = 36.0  # mm, of imported cameras
+
+
+def present(scene: bpy.types.Scene, obj: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The object, unless the user has deleted it: a pointer to it keeps a deleted object in the file."""
+    return obj if obj is not None and scene.objects.get(obj.name) == obj else None
 
 
 def splat_frame(obj: bpy.types.Object) -> np.ndarray:
@@ -132,11 +139,24 @@ def box_from_blender(obj: bpy.types.Object, frame: np.ndarray) -> Box:
 def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
     """The cameras that scene.gimp3d.views chooses, in the splat's frame, with the objects they come from.
 
+    No two have the same ID, though the same file may have been imported twice.
+
     Raises
     ------
     BadInput
         If there is none, with what to do.
     """
+    taken: set[str] = set()
+    for camera, obj in _chosen_views(context, frame):
+        path, number, name = PurePosixPath(camera.id), 1, camera.id
+        while name in taken:
+            number += 1
+            name = str(path.with_name(f"{path.stem}_{number}{path.suffix}"))
+        taken.add(name)
+        yield replace(camera, id=name), obj
+
+
+def _chosen_views(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
     scene, settings = context.scene, context.scene.gimp3d
     if settings.views == "ANIMATED":
         yield from _frames(context, frame)
@@ -147,8 +167,9 @@ def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Ca
     depsgraph = context.evaluated_depsgraph_get()
     for obj in chosen:
         yield camera_from_blender(obj, frame, scene, depsgraph), obj
-    if settings.reference and settings.reference not in chosen:
-        yield camera_from_blender(settings.reference, frame, scene, depsgraph), settings.reference
+    reference = present(scene, settings.reference)
+    if reference is not None and reference not in chosen:
+        yield camera_from_blender(reference, frame, scene, depsgraph), reference
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -157,7 +178,7 @@ def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     if settings.views == "COLLECTION":
         if settings.view_collection is None:
             raise BadInput("choose the collection whose cameras are the views")
-        pool: Sequence[bpy.types.Object] = settings.view_collection.all_objects
+        pool: Iterable[bpy.types.Object] = (o for o in settings.view_collection.all_objects if present(scene, o))
     else:
         pool = scene.objects
     return sorted((o for o in pool if o.type == "CAMERA"), key=lambda o: o.name)
@@ -178,5 +199,5 @@ def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Cam
 
 
 def safe_name(name: str) -> str:
-    """An object's name as a camera ID: no path in it."""
-    return name.replace("/", "_").replace("\\", "_").replace("..", "_").strip() or "camera"
+    """An object's name as a camera ID: no path, and no dot, as "Camera.001" would lose its number as an extension."""
+    return re.sub(r"[^\w\- ]", "_", name).strip() or "camera"

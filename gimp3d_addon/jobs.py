@@ -39,7 +39,7 @@ def new_job_folder(name: str) -> Path:
     return root / f"{clean}-{number:03d}"
 
 
-def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
+def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True) -> RemovalJob:
     """The scene, cameras, region, photos and settings as a job folder; returns the job with absolute paths.
 
     Raises
@@ -56,11 +56,11 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     context.view_layer.update()
     frame = bridge.splat_frame(splat)
     region = [bridge.box_from_blender(b, frame).to_json() for b in boxes]
-    reference = ""
+    wanted, reference = bridge.present(context.scene, settings.reference), ""
     cameras: list[Camera] = []
     for camera, obj in bridge.views_of(context, frame):
         cameras.append(camera)
-        if settings.reference is not None and obj == settings.reference and not reference:
+        if wanted is not None and obj == wanted and not reference:
             reference = camera.id
     picture = bpy.path.abspath(settings.reference_image) if settings.reference_image else ""
     if picture and not Path(picture).is_file():
@@ -70,7 +70,7 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
-    write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c in cameras])
+    write_transforms(folder / "transforms.json", [_with_photo(c, folder) if with_photos else c for c in cameras])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
         shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")

@@ -41,7 +41,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     gaussians = file.gaussians
     mesh.vertices.add(len(gaussians))
     usable = gaussians.usable
-    mesh.vertices.foreach_set("co", np.where(usable[:, None], gaussians.means, 0).astype(np.float32).ravel())
+    mesh.vertices.foreach_set("co", _shown_positions(gaussians).ravel())
     for prop in file.table.properties:
         _store_raw(mesh, prop, records[prop.name])
     _store_display(mesh, gaussians, usable)
@@ -89,7 +89,21 @@ def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
     else:
         rows = records.view(f"V{records.dtype.itemsize}") if len(records) else np.zeros(0, f"V{records.dtype.itemsize}")
     table = PlyTable(header, stored["line_end"], stored["format"], properties, rows)
-    return SplatFile(gaussians_of(table, mesh.name), table)
+    file = SplatFile(gaussians_of(table, mesh.name), table)
+    _refuse_moved(mesh, file.gaussians)
+    return file
+
+
+def _refuse_moved(mesh: bpy.types.Mesh, gaussians: Gaussians) -> None:
+    """After Apply Transform the mesh is no longer in the file's frame, and cameras and boxes would miss it."""
+    shown = np.empty(3 * len(gaussians), np.float32)
+    mesh.vertices.foreach_get("co", shown)
+    if not np.array_equal(shown.reshape(-1, 3), _shown_positions(gaussians)):
+        raise BadInput(f"{mesh.name}: vertices were moved, or a transform was applied; undo that and move the object")
+
+
+def _shown_positions(gaussians: Gaussians) -> np.ndarray:
+    return np.where(gaussians.usable[:, None], gaussians.means, 0).astype(np.float32)
 
 
 def _vertex_header(header: Sequence[str]) -> list[str]:

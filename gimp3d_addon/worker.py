@@ -103,6 +103,8 @@ class Worker:
         try:
             said = json.loads(line)
         except ValueError:
+            said = None
+        if not isinstance(said, dict):
             return  # something a library printed
         if said.get("stage") == "done":
             self.summary, self.progress, self.status = said.get("summary"), 1.0, "done"

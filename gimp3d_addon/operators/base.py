@@ -6,17 +6,27 @@ import bpy
 from gimp3d.errors import Gimp3dError
 
 from .. import splats
+from ..bridge import present
 from ..properties import preferences
 
 
+FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
+
+
+def one_line(error: Exception) -> str:
+    """An error as the command line would say it."""
+    text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+    return f"gimp3d: error: {text}"
+
+
 class ReportsErrors:
-    """Mixin: `execute` runs `work` and reports a Gimp3dError as one line."""
+    """Mixin: `execute` runs `work` and reports a failure as one line."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:
             self.work(context)
-        except Gimp3dError as error:
-            self.report({"ERROR"}, f"gimp3d: error: {error}")
+        except FAILURES as error:
+            self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -24,7 +34,7 @@ class ReportsErrors:
 def current_splat(context: bpy.types.Context) -> bpy.types.Object | None:
     """The chosen splat object, else the active one, else the only one."""
     settings = context.scene.gimp3d
-    if splats.is_splat(settings.splat):
+    if splats.is_splat(present(context.scene, settings.splat)):
         return settings.splat
     if splats.is_splat(context.active_object):
         return context.active_object
@@ -34,7 +44,7 @@ def current_splat(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def current_boxes(context: bpy.types.Context) -> list[bpy.types.Object]:
     """The region's boxes: the listed ones, else the active mesh that is no splat."""
-    listed = [r.object for r in context.scene.gimp3d.rois if r.object is not None]
+    listed = [r.object for r in context.scene.gimp3d.rois if present(context.scene, r.object)]
     active = context.active_object
     if not listed and active is not None and active.type == "MESH" and not splats.is_splat(active):
         return [active]

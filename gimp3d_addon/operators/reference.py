@@ -16,8 +16,7 @@ from .base import ReportsErrors, current_boxes, current_splat, python_of
 
 
 def _camera(context: bpy.types.Context) -> bpy.types.Object:
-    settings = context.scene.gimp3d
-    found = settings.reference or context.scene.camera
+    found = bridge.present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
     if found is None:
         raise BadInput("no camera; choose a reference view or set the scene's active camera")
     return found

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from gimp3d.errors import BadInput, Gimp3dError
+from gimp3d.errors import BadInput
 from gimp3d.io.ply import read_ply
 
 from .. import jobs, splats
+from ..bridge import present
 from ..worker import Worker
-from .base import current_boxes, current_splat, link, python_of
+from .base import FAILURES, current_boxes, current_splat, link, one_line, python_of
 
-SOURCE = "gimp3d_source"  # custom property of a result: the name of the hidden object it came from
+SOURCE = "gimp3d_source"  # custom property of a result: the hidden object it came from
 TICK = 0.1  # s between two looks at the child's progress
 
 
@@ -39,8 +40,8 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
         try:
             self._start(context)
             self._finish(context, self._worker.wait())
-        except Gimp3dError as error:
-            self.report({"ERROR"}, f"gimp3d: error: {error}")
+        except FAILURES as error:
+            self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -50,8 +51,8 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
             return self.execute(context)
         try:
             self._start(context)
-        except Gimp3dError as error:
-            self.report({"ERROR"}, f"gimp3d: error: {error}")
+        except FAILURES as error:
+            self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
         self._timer = context.window_manager.event_timer_add(TICK, window=context.window)
         context.window_manager.modal_handler_add(self)
@@ -76,16 +77,21 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
         self._stop(context)
         try:
             self._finish(context, self._worker.result())
-        except Gimp3dError as error:
-            self.report({"ERROR"}, f"gimp3d: error: {error}")
+        except FAILURES as error:
+            self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
         return {"FINISHED"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator: another file is opened, or the window closes."""
+        self._worker.cancel()
+        self._stop(context)
 
     def _start(self, context: bpy.types.Context) -> None:
         splat = current_splat(context)
         if splat is None:
             raise BadInput("no splat object; import a PLY first (3D-GIMP panel, step 1)")
-        self._source = splat
+        self._source = splat.name  # not the object: an undo meanwhile would make the reference invalid
         self._folder = jobs.new_job_folder(splat.name)
         jobs.write_job(context, self._folder)
         arguments = ["remove", "--job", str(self._folder), "--progress", "json"]
@@ -97,7 +103,10 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
         context.scene.gimp3d.progress, context.scene.gimp3d.status = 0.0, ""
 
     def _finish(self, context: bpy.types.Context, summary: dict[str, Any]) -> None:
-        result = bring_back(context, self._source, self._folder / "out.ply")
+        source, path = context.scene.objects.get(self._source), self._folder / "out.ply"
+        if source is None:
+            raise BadInput(f"{self._source} is no longer in the scene; the result lies in {path}")
+        result = bring_back(context, source, path)
         report = self._folder / "report" / "index.html"
         context.scene.gimp3d.last_report = str(report) if report.exists() else ""
         for warning in summary.get("warnings", ()):
@@ -113,12 +122,17 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
 def bring_back(context: bpy.types.Context, source: bpy.types.Object, path: Path) -> bpy.types.Object:
     """The finished PLY as a new object in the source's place; the source is hidden, not changed."""
     result = splats.create_object(f"{source.name} removed", read_ply(path), source.matrix_world.copy())
-    result[SOURCE] = source.name
+    result[SOURCE] = source
     link(context, result, source.users_collection[0] if source.users_collection else None)
-    source.hide_set(True)
-    source.hide_render = True
+    _hide(context, source, True)
     context.scene.gimp3d.splat = result
     return result
+
+
+def _hide(context: bpy.types.Context, obj: bpy.types.Object, hidden: bool) -> None:
+    obj.hide_render = hidden
+    if obj.name in context.view_layer.objects:  # an excluded collection's objects cannot be hidden, and need not be
+        obj.hide_set(hidden)
 
 
 class GIMP3D_OT_restore(bpy.types.Operator):
@@ -132,13 +146,12 @@ class GIMP3D_OT_restore(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Nothing was removed from this splat object")
         splat = current_splat(context)
-        return splat is not None and splat.get(SOURCE) in bpy.data.objects
+        return splat is not None and present(context.scene, splat.get(SOURCE)) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         result = current_splat(context)
-        source = bpy.data.objects[result[SOURCE]]
-        source.hide_set(False)
-        source.hide_render = False
+        source = result[SOURCE]
+        _hide(context, source, False)
         context.scene.gimp3d.splat = source
         mesh = result.data
         bpy.data.objects.remove(result)

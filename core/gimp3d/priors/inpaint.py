@@ -20,6 +20,8 @@ from ..errors import BadInput, IllPosed
 from ..io.images import read_image, write_png
 from ..solvers.exemplar import ExemplarSettings, complete_picture
 
+SURROUNDINGS = 1.0  # margin round the hole's bounding box that textures are taken from, in its side lengths
+LEAST_SURROUNDINGS = 32  # px, at least
 SPECK = 4  # px; smaller parts of a hole are interpolated
 HALO = 4  # px round the hole in which a picture is not compared with the view
 LEAST_COMPARED = 0.02  # share of the view that must lie outside the hole to judge a picture by
@@ -104,17 +106,31 @@ def _without_specks(provider: Provider, image: np.ndarray, hole: np.ndarray, see
 
 
 def exemplar(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
-    """Texture of the picture itself, from coarse to fine."""
-    done = complete_picture(image, hole, ExemplarSettings(seed=seed))
+    """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom of the same surface."""
+    near = _surroundings(hole)
+    done = complete_picture(image[near], hole[near], ExemplarSettings(seed=seed))
     if np.isnan(done.misfit):
         smooth = telea(image, hole, seed).image
         return Appearance(smooth, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    whole = image.copy()
+    whole[near] = done.image
     return Appearance(
-        done.image,
+        whole,
         confidence,
         f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels",
     )
+
+
+def _surroundings(hole: np.ndarray) -> tuple[slice, slice]:
+    """The hole's bounding box, larger by its own size on every side."""
+    spans = []
+    for axis in (0, 1):
+        there = np.flatnonzero(hole.any(1 - axis))
+        low, high = int(there[0]), int(there[-1]) + 1
+        margin = max(LEAST_SURROUNDINGS, round(SURROUNDINGS * (high - low)))
+        spans.append(slice(max(0, low - margin), high + margin))
+    return spans[0], spans[1]
 
 
 def telea(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
