@@ -19,7 +19,7 @@ MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has f
 class MappingSettings:
     """How sources are judged."""
 
-    visibility: float = 0.01  # λ_v, cost of a source that no view sees (printed with the wrong sign)
+    visibility: float = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
     depth_tolerance: float = 0.02  # z-test of visibility, relative
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 

@@ -40,10 +40,10 @@ def disc(height: int, width: int, radius: float) -> np.ndarray:
 
 def patches(image: np.ndarray, radius: int) -> np.ndarray:
     """[H, W, patch values] float64 in [0, 1], mirrored at the border."""
-    padded = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101) / 255
+    bordered = cv2.copyMakeBorder(image, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
+    h, w = image.shape[:2]
     size = 2 * radius + 1
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size), axis=(0, 1))
-    return windows.reshape(*image.shape[:2], -1)
+    return np.dstack([bordered[i : i + h, j : j + w] / 255 for i in range(size) for j in range(size)])
 
 
 def exhaustive(image: np.ndarray, target: np.ndarray, allowed: np.ndarray, penalty: np.ndarray) -> np.ndarray:

@@ -43,7 +43,7 @@ def by_projection(reference: Camera, depth: np.ndarray, views: list[View], toler
     """The definition, pixel by pixel, in float64."""
     shares = np.zeros(depth.shape)
     for i, j in np.argwhere(depth > 0):
-        point = reference.unproject(np.array([j + 0.5, i + 0.5]), np.float64(depth[i, j]))
+        point = reference.unproject(np.array([j + 0.5, i + 0.5]), np.asarray(depth[i, j], float))
         for view, there, hidden in views:
             uv, z = view.project(point)
             if z > 0 and 0 <= uv[0] < view.width and 0 <= uv[1] < view.height:
