@@ -31,7 +31,7 @@ class ExemplarSettings:
     """Lengths in pixels."""
 
     patch: int = 5  # side, odd
-    texture: float = 50.0  # weight of squared texture features beside squared colours (Newson 2017)
+    texture: float = 5.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
     smallest: int = 24  # no level is smaller
     coarse_rounds: int = 12  # of matching and voting on the coarsest level
     fewer_rounds: int = 3  # by which every finer level has fewer
