@@ -106,7 +106,7 @@ def _without_specks(provider: Provider, image: np.ndarray, hole: np.ndarray, see
 
 
 def exemplar(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
-    """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom of the same surface."""
+    """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
     near = _surroundings(hole)
     done = complete_picture(image[near], hole[near], ExemplarSettings(seed=seed))
     if np.isnan(done.misfit):
