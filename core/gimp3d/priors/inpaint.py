@@ -25,9 +25,7 @@ LEAST_SURROUNDINGS = 32  # px, at least
 SPECK = 4  # px; smaller parts of a hole are interpolated
 HALO = 4  # px round the hole in which a picture is not compared with the view
 LEAST_COMPARED = 0.02  # share of the view that must lie outside the hole to judge a picture by
-GROSS = (
-    64.0  # grey levels; larger differences count as this much, so that a few changed objects do not decide
-)
+GROSS = 64.0  # grey levels; larger differences count as this much, so that a few changed objects do not decide
 CLEARLY = 0.9  # registration is kept if it lowers the residual to this share, and by MARGIN
 MARGIN = 0.25  # grey levels
 MAX_SHIFT = 0.02  # of the picture's width; a picture that is off by more is not an edited copy of the view
@@ -71,9 +69,7 @@ def inpaint_reference(
     if not hole.any():
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
     if hole.all() and not spec.startswith("file:"):
-        raise IllPosed(
-            "appearance: the hole covers the whole reference; give a picture of it or choose another view"
-        )
+        raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
     filled = provider(image, hole, seed)
     return Appearance(np.where(hole[..., None], filled.image, image), filled.confidence, filled.reason)
 
@@ -135,9 +131,7 @@ def _surroundings(hole: np.ndarray) -> tuple[slice, slice]:
 
 def telea(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
     """Fast marching (Telea 2004), OpenCV."""
-    return Appearance(
-        cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA), 0.3, "interpolated by telea"
-    )
+    return Appearance(cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA), 0.3, "interpolated by telea")
 
 
 def navier_stokes(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
@@ -222,9 +216,7 @@ def paste_picture(
             f"average and correlates by {alike:.2f}; give a picture of the reference view itself"
         )
     words = f"picture pasted {words}, residual {residual:.1f} grey levels"
-    return Appearance(
-        np.where(hole[..., None], picture, image), float(np.exp(-residual / CONFIDENCE_SCALE)), words
-    )
+    return Appearance(np.where(hole[..., None], picture, image), float(np.exp(-residual / CONFIDENCE_SCALE)), words)
 
 
 def _resized(picture: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:

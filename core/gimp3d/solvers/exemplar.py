@@ -49,9 +49,7 @@ class Completion:
     """A picture with its hole filled."""
 
     image: np.ndarray  # [H, W, 3] uint8, outside the hole bit for bit the input
-    misfit: (
-        float  # RMS grey levels between pixels and their own patches' sources; NaN where none could be copied
-    )
+    misfit: float  # RMS grey levels between pixels and their own patches' sources; NaN where none could be copied
 
 
 def complete_picture(
@@ -162,9 +160,7 @@ def _settled(
     penalty = np.float32(settings.locality / hole.shape[1]) * away
     reach = settings.reach if field is not None else 0
     for number in range(rounds):
-        matching = PatchMatchSettings(
-            coherence=0.0, sweeps=settings.sweeps, draws=2, seed=settings.seed + 31 * number
-        )
+        matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, draws=2, seed=settings.seed + 31 * number)
         field = refined(field, current, touching, allowed, radius, matching, penalty, reach)
         sharpness = 1.0 / max(float(np.percentile(field.cost[touching], 75)), 255.0**-2)
         voted = _voted(current, hole, field, settings, sharpness)

@@ -31,9 +31,7 @@ class PatchMatchSettings:
 
     patch: int = 5  # side, odd (paper 4.1)
     coherence: float = 0.001  # λ_s, weight of the spatial term (paper 4.1)
-    truncation: float = (
-        8.0  # offsets that differ by more are incoherent (METHOD section 4: local, not image-sized)
-    )
+    truncation: float = 8.0  # offsets that differ by more are incoherent (METHOD section 4: local, not image-sized)
     levels: int = 5  # of the pyramid, at most
     sweeps: int = 5  # per level
     draws: int = 4  # random candidates per octave of distance and sweep
@@ -242,9 +240,7 @@ def _start_band(lo, hi, target, allowed, padded, penalty, radius, weight, random
                     k = int64(_hash(uint32(y * w + x) ^ _hash(random))) % len(centres)
                     rows[y, x], cols[y, x] = centres[k, 0], centres[k, 1]
                 v, u = rows[y, x], cols[y, x]
-                cost[y, x] = (
-                    weight * _appearance(padded, channels, y, x, v, u, radius, float32(1e30)) + penalty[v, u]
-                )
+                cost[y, x] = weight * _appearance(padded, channels, y, x, v, u, radius, float32(1e30)) + penalty[v, u]
             else:
                 rows[y, x], cols[y, x] = -1, -1
 
@@ -268,9 +264,7 @@ def _sweep_band(
             v, u = rows[y, x], cols[y, x]
             best = cost[y, x] + tie * _distance(y, x, v, u)
             if coherence > 0:
-                best += coherence * _incoherence(
-                    target, lo, hi, old_rows, old_cols, rows, cols, y, x, v, u, truncation
-                )
+                best += coherence * _incoherence(target, lo, hi, old_rows, old_cols, rows, cols, y, x, v, u, truncation)
             state = _hash(uint32(y * w + x) ^ salt)
             candidate, span = 0, reach
             while span > 0:

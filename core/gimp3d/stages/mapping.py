@@ -39,9 +39,7 @@ class MappingField:
 def source_visibility(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z-depth of the reference, 0 = nothing
-    views: Sequence[
-        tuple[Camera, np.ndarray, np.ndarray]
-    ],  # (camera, z-depth with the object, hidden pixels)
+    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, hidden pixels)
     settings: MappingSettings = MappingSettings(),
 ) -> np.ndarray:
     """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden.

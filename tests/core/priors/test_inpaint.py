@@ -226,9 +226,7 @@ def test_a_picture_of_something_else_is_refused(what: str, tmp_path: Path) -> No
         "inverted": 255 - picture,
         "constant": np.full_like(picture, 128),
     }[what]
-    refuse(
-        "does not match the view", save(tmp_path / "other.png", np.ascontiguousarray(other)), picture, hole
-    )
+    refuse("does not match the view", save(tmp_path / "other.png", np.ascontiguousarray(other)), picture, hole)
 
 
 def test_a_picture_of_another_shape_is_refused(tmp_path: Path) -> None:
