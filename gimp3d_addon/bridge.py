@@ -14,10 +14,11 @@ from pathlib import Path, PurePosixPath
 
 import bpy
 import numpy as np
+from mathutils import Matrix
+
 from gimp3d.box import Box, box_from_matrix
 from gimp3d.camera import Camera, Distortion
 from gimp3d.errors import BadInput
-from mathutils import Matrix
 
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
@@ -160,16 +161,17 @@ def _chosen_views(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tup
     scene, settings = context.scene, context.scene.gimp3d
     if settings.views == "ANIMATED":
         yield from _frames(context, frame)
-        return
-    chosen = chosen_cameras(scene)
-    if not chosen:
-        raise BadInput("no camera to look from; add views (3D-GIMP panel, step 3)")
-    depsgraph = context.evaluated_depsgraph_get()
-    for obj in chosen:
-        yield camera_from_blender(obj, frame, scene, depsgraph), obj
+        chosen = [scene.camera]
+    else:
+        chosen = chosen_cameras(scene)
+        if not chosen:
+            raise BadInput("no camera to look from; add views (3D-GIMP panel, step 3)")
+        depsgraph = context.evaluated_depsgraph_get()
+        for obj in chosen:
+            yield camera_from_blender(obj, frame, scene, depsgraph), obj
     reference = present(scene, settings.reference)
     if reference is not None and reference not in chosen:
-        yield camera_from_blender(reference, frame, scene, depsgraph), reference
+        yield camera_from_blender(reference, frame, scene, context.evaluated_depsgraph_get()), reference
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -193,7 +195,10 @@ def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Cam
         for number in range(scene.frame_start, scene.frame_end + 1, scene.frame_step):
             scene.frame_set(number)
             depsgraph = context.evaluated_depsgraph_get()
-            yield camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"), obj
+            yield (
+                camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"),
+                obj,
+            )
     finally:
         scene.frame_set(current[0], subframe=current[1])
 

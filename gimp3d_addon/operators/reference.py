@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
+
 from gimp3d.errors import BadInput
+from gimp3d.io.cameras import write_transforms
+from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob
 
-from .. import bridge, jobs
+from .. import bridge, jobs, splats
 from ..worker import Worker
 from .base import ReportsErrors, current_boxes, current_splat, python_of
 
@@ -22,19 +28,23 @@ def _camera(context: bpy.types.Context) -> bpy.types.Object:
     return found
 
 
-def _prepared(context: bpy.types.Context) -> tuple[Path, RemovalJob, str]:
-    """A job folder of the scene as it is, and the ID of the reference (else active) camera in it."""
+def _passing_folder() -> tempfile.TemporaryDirectory[str]:
+    """Not a job folder: what lies here is read into the .blend at once, and scenes are large."""
+    return tempfile.TemporaryDirectory(prefix="gimp3d-")
+
+
+def _prepared(context: bpy.types.Context, folder: Path) -> tuple[RemovalJob, str]:
+    """The scene as it is as a job, and the ID of the reference (else active) camera in it."""
     camera = _camera(context)
     settings = context.scene.gimp3d
     chosen, settings.reference = settings.reference, camera  # the camera must be among the job's views
     try:
-        folder = jobs.new_job_folder("preview")
-        job = jobs.write_job(context, folder)
+        job = jobs.write_job(context, folder, with_photos=False)
     finally:
         settings.reference = chosen
     if not job.reference:
         raise BadInput(f"camera {camera.name} is not among the views")
-    return folder, job, job.reference
+    return job, job.reference
 
 
 def _run(context: bpy.types.Context, *arguments: str) -> None:
@@ -70,24 +80,17 @@ class GIMP3D_OT_render_view(ReportsErrors, bpy.types.Operator):
         return current_splat(context) is not None and context.scene.camera is not None
 
     def work(self, context: bpy.types.Context) -> None:
-        from gimp3d.io.cameras import write_transforms
-
-        from ..splats import read_object
-        from .io import write_ply
-
         splat, camera = current_splat(context), context.scene.camera
         context.view_layer.update()
         frame = bridge.splat_frame(splat)
         view = bridge.camera_from_blender(camera, frame, context.scene, context.evaluated_depsgraph_get(), "view")
-        folder = jobs.new_job_folder("view")
-        folder.mkdir(parents=True)
-        file = read_object(splat)
-        write_ply(folder / "scene.ply", file, [True] * len(file.gaussians))
-        write_transforms(folder / "transforms.json", [view])
-        _run(
-            context, "render", str(folder / "scene.ply"), "--cameras", str(folder / "transforms.json"), "--out", str(folder)
-        )
-        _picture(folder / "view.png", "3D-GIMP view")
+        file = splats.read_object(splat)
+        with _passing_folder() as name:
+            ply, cameras = Path(name, "scene.ply"), Path(name, "transforms.json")
+            write_ply(ply, file, np.ones(len(file.gaussians), bool))
+            write_transforms(cameras, [view])
+            _run(context, "render", str(ply), "--cameras", str(cameras), "--out", name)
+            _picture(Path(name, "view.png"), "3D-GIMP view")
 
 
 class GIMP3D_OT_preview_masks(ReportsErrors, bpy.types.Operator):
@@ -102,17 +105,18 @@ class GIMP3D_OT_preview_masks(ReportsErrors, bpy.types.Operator):
         return current_splat(context) is not None and bool(current_boxes(context))
 
     def work(self, context: bpy.types.Context) -> None:
-        folder, job, name = _prepared(context)
-        _masks(context, folder, job, name)
-        _picture(folder / "masks" / f"{_stem(name)}.png", "3D-GIMP mask")
+        with _passing_folder() as folder:
+            job, name = _prepared(context, Path(folder))
+            _picture(_mask(context, Path(folder), job, name), "3D-GIMP mask")
 
 
-def _masks(context: bpy.types.Context, folder: Path, job: RemovalJob, name: str) -> None:
+def _mask(context: bpy.types.Context, folder: Path, job: RemovalJob, name: str) -> Path:
     mode = "paper" if job.preset == "paper" else "need"
     _run(
         context, "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
         "--frames", name, "--mode", mode,
     )  # fmt: skip
+    return folder / "masks" / f"{_stem(name)}.png"
 
 
 class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
@@ -149,15 +153,14 @@ class GIMP3D_OT_export_reference(ReportsErrors, bpy.types.Operator, ExportHelper
 
     def work(self, context: bpy.types.Context) -> None:
         target = Path(bpy.path.abspath(self.filepath))
-        folder, job, name = _prepared(context)
-        _masks(context, folder, job, name)
-        _run(
-            context, "render", job.scene, "--cameras", job.cameras, "--out", str(folder / "render"), "--frames", name
-        )
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes((folder / "render" / f"{_stem(name)}.png").read_bytes())
         mask = target.with_name(f"{target.stem}.mask.png")
-        mask.write_bytes((folder / "masks" / f"{_stem(name)}.png").read_bytes())
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with _passing_folder() as folder:
+            job, name = _prepared(context, Path(folder))
+            shutil.copyfile(_mask(context, Path(folder), job, name), mask)
+            out = Path(folder, "render")
+            _run(context, "render", job.scene, "--cameras", job.cameras, "--out", str(out), "--frames", name)
+            shutil.copyfile(out / f"{_stem(name)}.png", target)
         context.scene.gimp3d.reference = _camera(context)
         self.report({"INFO"}, f"{target.name} and {mask.name} written")
 
