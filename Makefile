@@ -2,6 +2,7 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all lint bench extension screenshots clean
@@ -31,10 +32,13 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: $(READY)
-	$(BIN)/python scripts/bench.py
+	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,paper --out build/bench
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
+
+screenshots: demo
+	cp build/demo/before_after.png assets/before_after.png
 
 clean:
 	rm -rf build dist $(VENV)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import write_transforms

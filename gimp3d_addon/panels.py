@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+
 from gimp3d.errors import BadInput
 
 from . import bridge

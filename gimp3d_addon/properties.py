@@ -52,7 +52,9 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         poll=lambda _, candidate: candidate.type == "CAMERA",
     )
     reference_image: StringProperty(
-        name="Picture", description="The reference view without the object, painted in any tool", subtype="FILE_PATH"
+        name="Picture",
+        description="The reference view without the object, painted in any tool",
+        subtype="FILE_PATH",
     )
     preset: EnumProperty(items=PRESETS, name="Preset", default="balanced")
     inpaint: StringProperty(
@@ -61,7 +63,9 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="What invents the never-seen part: exemplar, telea, ns, shiftmap, file:PATH or command:CMD",
     )
     depth_prior: StringProperty(
-        name="Surface", default="auto", description="How the hidden surface goes on: auto, harmonic, planar, file:PATH"
+        name="Surface",
+        default="auto",
+        description="How the hidden surface goes on: auto, harmonic, planar, file:PATH",
     )
     seed: IntProperty(name="Seed", default=0, min=0)
     progress: FloatProperty(min=0, max=1, options={"SKIP_SAVE"})

@@ -1,7 +1,7 @@
 """A Gaussian scene as a Blender object: mesh vertices, named attributes, instances on points, a falloff material.
 
-Every PLY property is kept losslessly in its own attribute, so that an export gives the file's bytes back; the attributes
-`scale`, `rotation`, `opacity` and `color` hold activated values for drawing.
+Every PLY property is kept losslessly in its own attribute, so that an export gives the file's bytes back; the
+attributes `scale`, `rotation`, `opacity` and `color` hold activated values for drawing.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Matrix
+
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussians_of, values
-from mathutils import Matrix
 
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
@@ -243,7 +244,7 @@ def _named(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSock
 
 
 def splat_material() -> bpy.types.Material:
-    """Emission of the splat's colour with Gaussian falloff: opacity · exp(−d²/2), d the ray's distance from the centre."""
+    """Emission of a splat's colour with falloff: opacity · exp(−d²/2), d the ray's distance to the centre."""
     if MATERIAL in bpy.data.materials:
         return bpy.data.materials[MATERIAL]
     material = bpy.data.materials.new(MATERIAL)
@@ -285,7 +286,11 @@ def splat_material() -> bpy.types.Material:
     falloff = math("EXPONENT", math("MULTIPLY", distance, -0.5 * EXTENT**2))
     front = math("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
     alpha = math("MULTIPLY", math("MULTIPLY", falloff, opacity.outputs["Fac"]), front)
-    emission, clear, mix = node("ShaderNodeEmission"), node("ShaderNodeBsdfTransparent"), node("ShaderNodeMixShader")
+    emission, clear, mix = (
+        node("ShaderNodeEmission"),
+        node("ShaderNodeBsdfTransparent"),
+        node("ShaderNodeMixShader"),
+    )
     out = node("ShaderNodeOutputMaterial")
     link(colour.outputs["Color"], emission.inputs["Color"])
     link(alpha, mix.inputs["Fac"])

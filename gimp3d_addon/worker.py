@@ -29,7 +29,7 @@ class Worker:
     def __init__(self, arguments: Sequence[str], python: str = "") -> None:
         interpreter = python or sys.executable
         folder = str(Path(gimp3d.__file__).resolve().parents[1])
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115, lives as long as the child
         try:
             self._process = subprocess.Popen(
                 [interpreter, "-c", BOOT, folder, *arguments],
@@ -40,7 +40,9 @@ class Worker:
                 encoding="utf-8",
             )
         except OSError as error:
-            raise BadInput(f"cannot start {interpreter} ({error.strerror}); choose a Python in the preferences") from None
+            raise BadInput(
+                f"cannot start {interpreter} ({error.strerror}); choose a Python in the preferences"
+            ) from None
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

@@ -27,7 +27,12 @@ TAGS = {
     ("Windows", "AMD64"): "windows-x64",
     ("Darwin", "arm64"): "macos-arm64",
 }
-ENTRY = '"""3D-GIMP, installed as a Blender extension."""\n\nfrom .gimp3d_addon import register, unregister\n\n__all__ = ["register", "unregister"]\n'
+ENTRY = '''"""3D-GIMP, installed as a Blender extension."""
+
+from .gimp3d_addon import register, unregister
+
+__all__ = ["register", "unregister"]
+'''
 
 
 def main() -> None:

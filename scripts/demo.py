@@ -21,9 +21,9 @@ sys.path.insert(0, str(ROOT))
 
 import bpy
 import cv2
-import gimp3d_addon
 import numpy as np
 
+import gimp3d_addon
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import write_png
 from gimp3d.io.ply import read_ply

@@ -90,7 +90,9 @@ def splat(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, step: fl
     )
 
 
-def grid(low: float, high: float, step: float, other: tuple[float, float] | None = None) -> tuple[np.ndarray, np.ndarray]:
+def grid(
+    low: float, high: float, step: float, other: tuple[float, float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Centres of square cells, as two flat arrays."""
     second = other or (low, high)
     a, b = np.arange(low + step / 2, high, step), np.arange(second[0] + step / 2, second[1], step)
@@ -136,7 +138,9 @@ def walls() -> Gaussians:
     return back.extended(side)
 
 
-def ball(centre: tuple[float, float, float], radius: float, colours: tuple[tuple[float, ...], tuple[float, ...]]) -> Gaussians:
+def ball(
+    centre: tuple[float, float, float], radius: float, colours: tuple[tuple[float, ...], tuple[float, ...]]
+) -> Gaussians:
     """A striped ball, Fibonacci points."""
     count = int(4 * math.pi * radius**2 / 0.0135**2)
     k = np.arange(count) + 0.5
@@ -147,7 +151,12 @@ def ball(centre: tuple[float, float, float], radius: float, colours: tuple[tuple
     return splat(np.array(centre) + radius * n, n, mix(*colours, stripes), 0.0145)
 
 
-def cuboid(centre: tuple[float, float, float], size: tuple[float, float, float], turn: float, colour: tuple[float, ...]) -> Gaussians:
+def cuboid(
+    centre: tuple[float, float, float],
+    size: tuple[float, float, float],
+    turn: float,
+    colour: tuple[float, ...],
+) -> Gaussians:
     """A book: five faces, pages on the long side."""
     c, s = math.cos(turn), math.sin(turn)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -160,7 +169,11 @@ def cuboid(centre: tuple[float, float, float], size: tuple[float, float, float],
         normal = np.zeros(3)
         normal[axis] = sign
         pages = axis != 2 and not (axis == 1 and sign == -1)
-        paint = mix((0.9, 0.87, 0.78), (0.78, 0.74, 0.64), 0.5 + 0.5 * np.sin(400 * v)) if pages else np.tile(colour, (len(u), 1))
+        paint = (
+            mix((0.9, 0.87, 0.78), (0.78, 0.74, 0.64), 0.5 + 0.5 * np.sin(400 * v))
+            if pages
+            else np.tile(colour, (len(u), 1))
+        )
         normals = np.tile(rotation @ normal, (len(u), 1))
         parts.append(splat(np.array(centre) + local @ rotation.T, normals, paint, 0.014))
     return joined(parts)
@@ -169,7 +182,11 @@ def cuboid(centre: tuple[float, float, float], size: tuple[float, float, float],
 def vase() -> Gaussians:
     """A surface of revolution with a glazed pattern: the thing to remove."""
     height = np.linspace(0, 0.36, 400)
-    radius = 0.105 + 0.06 * np.sin(np.pi * np.clip(height / 0.27, 0, 1)) ** 1.3 - 0.06 * np.exp(-(((height - 0.31) / 0.045) ** 2))
+    radius = (
+        0.105
+        + 0.06 * np.sin(np.pi * np.clip(height / 0.27, 0, 1)) ** 1.3
+        - 0.06 * np.exp(-(((height - 0.31) / 0.045) ** 2))
+    )
     slope = np.gradient(radius, height)
     points, normals, colours = [], [], []
     travelled = np.concatenate([[0], np.cumsum(np.hypot(np.diff(height), np.diff(radius)))])

@@ -67,7 +67,10 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--reference", metavar="ID", help="the view to complete first (default: chosen)")
     remove.add_argument("--reference-image", metavar="FILE", help="that view without the object")
     remove.add_argument(
-        "--inpaint", default="exemplar", metavar="PROVIDER", help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD"
+        "--inpaint",
+        default="exemplar",
+        metavar="PROVIDER",
+        help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD",
     )
     remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH")
     remove.add_argument("--preset", choices=("draft", "balanced", "best", "paper", "paper-literal"), default="balanced")
@@ -97,6 +100,13 @@ def build_parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--mask-suffix", default=".mask.png")
     evaluate.add_argument("--exclude", default="", metavar="ID,ID")
     evaluate.add_argument("--json", metavar="FILE")
+
+    bench = commands.add_parser("bench", help="score removals on scenes with ground truth, beside baselines")
+    bench.add_argument("data", metavar="DATA", help="folder of scenes, each with truth/")
+    bench.add_argument("--out", required=True, metavar="DIR", help="where results and pictures go")
+    bench.add_argument("--scenes", metavar="NAME,NAME")
+    bench.add_argument("--presets", default="balanced", metavar="NAME,NAME")
+    _running(bench)
     return parser
 
 
@@ -146,9 +156,7 @@ class Reporter:
 
     def __call__(self, stage: str, done: int, total: int, message: str = "") -> None:
         if self.kind == "json":
-            print(
-                json.dumps({"stage": stage, "done": done, "total": total, "message": message}), flush=True
-            )
+            print(json.dumps({"stage": stage, "done": done, "total": total, "message": message}), flush=True)
         elif self.kind == "bar":
             filled = 24 * done // max(1, total)
             line = f"{stage:<14} [{'#' * filled}{'.' * (24 - filled)}] {done}/{total} {message}"[:110]
@@ -286,6 +294,20 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
         print(f"{name:<20} {row['psnr']:8.2f} {row['ssim']:7.3f} {row['flip']:7.3f}")
 
 
+def _bench(given: Namespace, shown: Reporter) -> None:
+    from .evaluate.benchmark import run_benchmark, table
+    from .pipeline import PRESETS
+    from .threads import set_thread_count
+
+    presets = _names(given.presets) or ()
+    unknown = [p for p in presets if p not in PRESETS]
+    if unknown:
+        raise BadInput(f"--presets: no preset {', '.join(unknown)}; there are {', '.join(PRESETS)}")
+    set_thread_count(given.threads)
+    rows = run_benchmark(Path(given.data), Path(given.out), _names(given.scenes) or (), presets, shown)
+    print(table(rows))
+
+
 COMMANDS = {
     "info": _info,
     "convert": _convert,
@@ -294,6 +316,7 @@ COMMANDS = {
     "remove": _remove,
     "orbit": _orbit,
     "evaluate": _evaluate,
+    "bench": _bench,
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from . import __version__
 from .box import read_region
 from .camera import Camera
-from .errors import BadInput, IllPosed
+from .errors import BadInput
 from .io.cameras import read_cameras, write_transforms
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, read_ply, write_gaussians, write_ply
@@ -26,8 +26,8 @@ from .orbit import orbit_cameras
 from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .stages.masks import MaskSettings, find_masks
 from .report import write_removal_report
+from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
 
@@ -190,9 +190,7 @@ def run_removal(
     given = read_image(Path(job.reference_image)) if job.reference_image else None
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     store = StageStore(folder / "stages", _job_key(job, views), STORED, resume) if folder else None
-    result = remove_object(
-        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store
-    )
+    result = remove_object(file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store)
     write_ply(out, file, result.keep, result.added)
     if job.views_out:
         for name, image in result.painted.items():
@@ -201,7 +199,7 @@ def run_removal(
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), file.gaussians, views, result, summary)
-    for path in filter(None, (job.summary, folder and folder / "summary.json")):
+    for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
     return summary
 
@@ -214,9 +212,7 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
     BadInput
         If a key of --set does not exist or its value is of the wrong type.
     """
-    settings = replace(
-        PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed
-    )
+    settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
     for key, text in job.set.items():
         settings = _with(settings, key.split("."), text, key)
     return settings
@@ -338,7 +334,7 @@ def _job_key(job: RemovalJob, views: Sequence[View]) -> str:
             digest.update(Path(path).read_bytes())
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
-        digest.update(np.ascontiguousarray(view.image))
+        digest.update(view.image.tobytes())
     return digest.hexdigest()
 
 

@@ -1,8 +1,8 @@
 """The job folder: everything a removal needs and everything it made, so that it can resume or move.
 
-    DIR/job.json      the RemovalJob; paths inside are relative to DIR where possible
-    DIR/stages/       one .npz (+ .json) per finished stage, with a key of its inputs
-    DIR/summary.json  written at the end
+DIR/job.json      the RemovalJob; paths inside are relative to DIR where possible
+DIR/stages/       one .npz (+ .json) per finished stage, with a key of its inputs
+DIR/summary.json  written at the end
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class RemovalJob:
 
     def resolved(self, folder: Path) -> RemovalJob:
         """The same job with its relative paths made absolute against `folder`."""
-        return replace(self, **{k: v if v == "none" else str(folder / v) for k, v in self._paths().items()})
+        return self._with_paths(lambda v: str(folder / v))
 
     def relative_to(self, folder: Path) -> RemovalJob:
         """The same job with paths below `folder` made relative to it, so that the folder can move."""
@@ -57,10 +57,14 @@ class RemovalJob:
             absolute = Path(value).resolve()
             return absolute.relative_to(root).as_posix() if absolute.is_relative_to(root) else str(absolute)
 
-        return replace(self, **{k: v if v == "none" else shorten(v) for k, v in self._paths().items()})
+        return self._with_paths(shorten)
 
-    def _paths(self) -> dict[str, Any]:
-        return {k: getattr(self, k) for k in self.PATHS if getattr(self, k) is not None}
+    def _with_paths(self, change: Callable[[str], str]) -> RemovalJob:
+        changed: dict[str, Any] = {}
+        for name in self.PATHS:
+            value = getattr(self, name)
+            changed[name] = value if value in (None, "none") else change(value)
+        return replace(self, **changed)
 
 
 def save_job(folder: Path, job: RemovalJob) -> None:

@@ -54,9 +54,7 @@ def orbit_cameras(
         azimuth = 2 * math.pi * k / count
         away = math.cos(elevation) * (math.cos(azimuth) * side + math.sin(azimuth) * front) + math.sin(elevation) * axis
         viewmat = look_at(centre + distance * away, centre, axis)
-        cameras.append(
-            Camera(f"orbit/{k:03d}", width, height, focal, focal, width / 2, height / 2, viewmat, "train")
-        )
+        cameras.append(Camera(f"orbit/{k:03d}", width, height, focal, focal, width / 2, height / 2, viewmat, "train"))
     return tuple(cameras)
 
 

@@ -22,8 +22,8 @@ from .stages.mapping import MappingField, MappingSettings, mapping_field, source
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from .stages.propagate import (
     PaintedView,
-    Propagation,
     PropagateSettings,
+    Propagation,
     Reference,
     Rule,
     ViewToPaint,
@@ -69,7 +69,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", support=0.0),
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic"),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=float("inf")),
         propagate=PropagateSettings(transfer="sample"),
         use_evidence=False,
         extra_references=0,
@@ -144,7 +144,7 @@ class _Run:
             result = work()
             if self.store:
                 self.store.save(name, result)
-        confidence, reason = words(result) if words else (result.confidence, result.reason)  # type: ignore[attr-defined]
+        confidence, reason = words(result) if words else (result.confidence, result.reason)  # type: ignore
         self.stages.append(StageReport(name, time.perf_counter() - start, float(confidence), reason))
         self.progress(name, 1, 1, reason)
         return result
@@ -154,7 +154,7 @@ def remove_object(
     scene: Gaussians,
     views: Sequence[View],
     region: Region,
-    settings: RemovalSettings = RemovalSettings(),  # noqa: B008
+    settings: RemovalSettings = RemovalSettings(),
     reference: str | None = None,
     reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
     progress: Progress = silent,
@@ -222,9 +222,7 @@ def remove_object(
         filled = kept.extended(added)
         painted.update({p.camera_id: p.image for p in painting.views})
         rules = {p.camera_id: p.rules for p in painting.views}
-        open_views = tuple(
-            parallel_map(lambda v, f=filled, n=len(added), r=rules: _still_open(v, f, n, r[v.camera.id]), open_views)
-        )
+        open_views = _all_still_open(open_views, filled, len(added), rules)
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
         run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
@@ -278,7 +276,10 @@ def _fill_from_one_view(
             view.target,
             source,
             source_visibility(
-                view.camera, depth, [(v.camera, v.depth_before, v.silhouette) for v in open_views], settings.mapping
+                view.camera,
+                depth,
+                [(v.camera, v.depth_before, v.silhouette) for v in open_views],
+                settings.mapping,
             ),
             settings.mapping,
             settings.random_seed,
@@ -343,6 +344,12 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
+def _all_still_open(
+    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray]
+) -> tuple[ViewMasks, ...]:
+    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id]), views))
+
+
 def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray) -> ViewMasks:
     """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
 
@@ -353,7 +360,10 @@ def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarra
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
     after = render(filled, view.camera, RasterSettings(), frozenset({"depth", "alpha"}))
     return replace(
-        view, target=view.target & (~covered | (rules == Rule.UNREACHED)), depth_after=after.median_depth, alpha_after=after.alpha
+        view,
+        target=view.target & (~covered | (rules == Rule.UNREACHED)),
+        depth_after=after.median_depth,
+        alpha_after=after.alpha,
     )
 
 

@@ -29,8 +29,10 @@ h1{font-size:1.6rem;margin:0}h2{font-size:1.15rem;margin:2rem 0 .6rem}
 table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.3rem .6rem;border-bottom:1px solid var(--edge)}
 td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:1rem}
-figure{margin:0}figure img{width:100%;border-radius:6px;display:block}figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
-.flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}.flip:hover img+img{opacity:1}
+figure{margin:0}figure img{width:100%;border-radius:6px;display:block}
+figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
+.flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}
+.flip:hover img+img{opacity:1}
 .bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
 .warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
 .dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
@@ -102,7 +104,8 @@ def relief(
     there = disparity[depth > 0]
     low, high = np.percentile(there, [2, 98]) if len(there) else (0.0, 1.0)
     colour = cv2.applyColorMap(
-        (np.clip((disparity - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS
+        (np.clip((disparity - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8),
+        cv2.COLORMAP_VIRIDIS,
     )[..., ::-1]
     slope = np.gradient(disparity, axis=0) / max(high - low, 1e-12)
     shade = np.clip(1 + 12 * slope, 0.6, 1.3)[..., None]
@@ -122,9 +125,7 @@ def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.
     return np.where(there[..., None], colour, image // 2)
 
 
-def _page(
-    summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictures: Sequence[tuple[str, str]]
-) -> str:
+def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictures: Sequence[tuple[str, str]]) -> str:
     counts, text = summary["counts"], html.escape
     longest = max((s["seconds"] for s in summary["stages"]), default=1) or 1
     rows = "".join(
@@ -142,7 +143,8 @@ def _page(
         f"<figure><img src='{name}' alt=''><figcaption>{text(title)}</figcaption></figure>" for title, name in pictures
     )
     legend = "".join(
-        f"<span class=dot style='background:rgb{colour}'></span>{text(words)}" for words, colour in RULE_COLOURS.values()
+        f"<span class=dot style='background:rgb{colour}'></span>{text(words)}"
+        for words, colour in RULE_COLOURS.values()
     )
     warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
     numbers = "".join(f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>" for k, v in counts.items())

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import bpy
+
 from gimp3d.errors import Gimp3dError
 
 from .. import splats
 from ..bridge import present
 from ..properties import preferences
-
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
 

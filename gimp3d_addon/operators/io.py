@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
+
 from gimp3d.errors import BadInput
 from gimp3d.io.ply import read_ply, write_ply
 

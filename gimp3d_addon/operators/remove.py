@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+
 from gimp3d.errors import BadInput
 from gimp3d.io.ply import read_ply
 

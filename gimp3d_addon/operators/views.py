@@ -8,11 +8,12 @@ from pathlib import Path
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
+from mathutils import Matrix, Vector
+
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras
 from gimp3d.orbit import orbit_cameras
-from mathutils import Matrix, Vector
 
 from .. import bridge
 from .base import ReportsErrors, current_boxes, current_splat, link
@@ -43,7 +44,9 @@ class GIMP3D_OT_import_cameras(ReportsErrors, bpy.types.Operator, ImportHelper):
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
     images: StringProperty(name="Photos", subtype="DIR_PATH", description="Folder of the photos, if not beside")
     split: EnumProperty(
-        items=(("train", "Training", ""), ("test", "Test", ""), ("all", "All", "")), name="Frames", default="train"
+        items=(("train", "Training", ""), ("test", "Test", ""), ("all", "All", "")),
+        name="Frames",
+        default="train",
     )
 
     @classmethod

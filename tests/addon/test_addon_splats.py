@@ -12,7 +12,7 @@ from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.ply import read_ply, write_gaussians
 
 bpy = pytest.importorskip("bpy", reason="Blender's Python module bpy is not installed")
-import bmesh  # noqa: E402, comes with bpy
+import bmesh
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]
@@ -136,9 +136,7 @@ def test_other_elements_are_dropped_and_the_file_stays_whole(tmp_path: Path) -> 
     assert (tmp_path / "out.ply").read_bytes() == ply_bytes(properties)
 
 
-@pytest.mark.parametrize(
-    ("up", "expected"), [("FILE", (0, 0, 1)), ("Y_DOWN", (0, -1, 0)), ("Y_UP", (0, 1, 0))]
-)
+@pytest.mark.parametrize(("up", "expected"), [("FILE", (0, 0, 1)), ("Y_DOWN", (0, -1, 0)), ("Y_UP", (0, 1, 0))])
 def test_the_up_axis_goes_into_the_matrix_only(
     up: str, expected: tuple[float, float, float], few_gaussians: Gaussians, tmp_path: Path
 ) -> None:
@@ -203,7 +201,9 @@ def test_every_usable_splat_is_one_instance(few_gaussians: Gaussians, import_sce
 
 def test_a_large_scene_is_shown_as_points(few_gaussians: Gaussians, import_scene) -> None:
     import_scene(few_gaussians.take(np.arange(200_001) % 50))
-    assert not any(i.is_instance and i.object.type == "MESH" for i in bpy.context.evaluated_depsgraph_get().object_instances)
+    assert not any(
+        i.is_instance and i.object.type == "MESH" for i in bpy.context.evaluated_depsgraph_get().object_instances
+    )
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import bpy
 import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
-from gimp3d_addon import bridge
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mathutils import Euler, Matrix, Vector
@@ -19,6 +18,7 @@ from scenes import cameras
 from gimp3d.box import Box
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras, write_transforms
+from gimp3d_addon import bridge
 
 NO_FIXTURE_CHECK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -84,7 +84,11 @@ def test_the_same_camera_from_a_file_and_through_blender(tmp_path: Path) -> None
         assert np.abs(back.viewmat - camera.viewmat).max() < 2e-5  # Blender's matrices are float32
         del obj[bridge.CAMERA]  # and what Blender itself frames is the same picture
         render = bpy.context.scene.render
-        render.resolution_x, render.resolution_y, render.resolution_percentage = camera.width, camera.height, 100
+        render.resolution_x, render.resolution_y, render.resolution_percentage = (
+            camera.width,
+            camera.height,
+            100,
+        )
         assert np.allclose(read(obj, np.array(frame)).K, camera.K, rtol=1e-5)
 
 

@@ -81,7 +81,18 @@ def test_the_full_zip_carries_all_that_the_core_needs(tmp_path: Path) -> None:
     site = Path(np.__file__).resolve().parents[1]
     bare = tmp_path / "bare"
     bare.mkdir()
-    for name in ("bpy", "numpy", "numpy.libs", "requests", "urllib3", "certifi", "idna", "charset_normalizer", "zstandard", "cython"):
+    for name in (
+        "bpy",
+        "numpy",
+        "numpy.libs",
+        "requests",
+        "urllib3",
+        "certifi",
+        "idna",
+        "charset_normalizer",
+        "zstandard",
+        "cython",
+    ):
         if (site / name).exists():
             (bare / name).symlink_to(site / name)
     environment = {"PYTHONPATH": str(bare), "GIMP3D_CACHE": str(tmp_path / "cache")}

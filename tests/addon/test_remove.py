@@ -9,8 +9,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from gimp3d_addon import panels, splats
-from gimp3d_addon.worker import Worker
 from mathutils import Euler, Matrix, Vector
 from scenes import REGION, cameras, scene
 
@@ -19,6 +17,8 @@ from gimp3d.errors import Gimp3dError
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
+from gimp3d_addon import panels, splats
+from gimp3d_addon.worker import Worker
 
 
 @pytest.fixture
@@ -66,7 +66,16 @@ def test_blender_and_the_shell_give_the_same_scene(folder: Path) -> None:
     prepare(folder)
     bpy.ops.gimp3d.remove_object()
     bpy.ops.gimp3d.export_ply(filepath=str(folder / "blender.ply"))
-    arguments = ["remove", "scene.ply", "--cameras", "transforms.json", "--roi", "roi.json", "--out", "shell.ply"]
+    arguments = [
+        "remove",
+        "scene.ply",
+        "--cameras",
+        "transforms.json",
+        "--roi",
+        "roi.json",
+        "--out",
+        "shell.ply",
+    ]
     paths = [str(folder / a) if re.search(r"\.\w+$", a) else a for a in arguments]
     assert main([*paths, "--images", "none", "--progress", "none"]) == 0
     same_picture(folder / "blender.ply", folder / "shell.ply")
@@ -139,7 +148,15 @@ def test_errors_are_the_command_lines_own_line_and_change_nothing(folder: Path, 
 
 
 def test_without_a_scene_the_operators_say_what_is_missing() -> None:
-    for name in ("remove_object", "add_roi", "add_views", "export_ply", "restore", "render_view", "preview_masks"):
+    for name in (
+        "remove_object",
+        "add_roi",
+        "add_views",
+        "export_ply",
+        "restore",
+        "render_view",
+        "preview_masks",
+    ):
         assert not getattr(bpy.ops.gimp3d, name).poll()
 
 

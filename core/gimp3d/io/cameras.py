@@ -22,11 +22,39 @@ from ..job import write_atomically
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
 REFUSED = {
-    "fisheye": ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "FOV", "FISHEYE"),
-    "panoramic": ("EQUIRECTANGULAR", "SPHERICAL", "VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "PANORAMIC"),
-    "orthographic": ("ORTHOGRAPHIC", "ORTHOPHOTO"),
-}  # fmt: skip
-COLMAP_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
+    "fisheye": {
+        "OPENCV_FISHEYE",
+        "SIMPLE_RADIAL_FISHEYE",
+        "RADIAL_FISHEYE",
+        "THIN_PRISM_FISHEYE",
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        "FOV",
+        "FISHEYE",
+    },
+    "panoramic": {
+        "EQUIRECTANGULAR",
+        "SPHERICAL",
+        "VR180_L",
+        "VR180_R",
+        "OMNIDIRECTIONALSTEREO_L",
+        "OMNIDIRECTIONALSTEREO_R",
+        "PANORAMIC",
+    },
+    "orthographic": {"ORTHOGRAPHIC", "ORTHOPHOTO"},
+}
+COLMAP_MODELS = (  # by their numbers in cameras.bin
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+)
 COLMAP_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
 
 
@@ -201,9 +229,7 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
     return tuple(cameras)
 
 
-def _transforms_intrinsics(
-    both: dict[str, Any], photo: Path, where: str
-) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
+def _transforms_intrinsics(both: dict[str, Any], photo: Path, where: str) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
     width, height = both.get("w"), both.get("h")
     if width is None or height is None:
         width, height = _image_size(photo, where)
@@ -275,7 +301,10 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
     except (struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError) as error:
         raise BadInput(f"the COLMAP model in {model} is damaged ({error})") from None
     if images is None:
-        images = next((f for f in (folder / "images", folder.parent / "images", folder.parent.parent / "images") if f.is_dir()), folder)
+        images = next(
+            (f for f in (folder / "images", folder.parent / "images", folder.parent.parent / "images") if f.is_dir()),
+            folder,
+        )
     cameras = []
     for name, lens, quat, translation in poses:
         where = f"{model}, image {name}"

@@ -77,13 +77,17 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
     factor = width / camera.width
     if abs(height - factor * camera.height) > max(ASPECT_TOLERANCE, ASPECT_TOLERANCE * factor):
         raise BadInput(
-            f"{camera.image} has {width}×{height} pixels, which does not fit its camera's {camera.width}×{camera.height}"
+            f"{camera.image} has {width}×{height} pixels, which not its camera's {camera.width}×{camera.height}"
         )
     if (width, height) != (camera.width, camera.height):
         way = cv2.INTER_AREA if factor > 1 else cv2.INTER_LINEAR
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=way)
     if camera.distortion is not None:
-        at_integers = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's pixel centres are whole numbers
+        at_integers = camera.K - [
+            [0, 0, 0.5],
+            [0, 0, 0.5],
+            [0, 0, 0],
+        ]  # OpenCV's pixel centres are whole numbers
         photo = cv2.undistort(photo, at_integers, camera.distortion.coefficients)
     return photo, undistorted(camera)
 

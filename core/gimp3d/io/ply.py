@@ -97,7 +97,10 @@ def write_ply(
         If a new Gaussian is not finite.
     """
     table, count = file.table, int(np.count_nonzero(keep)) + (len(added) if added is not None else 0)
-    lines = [re.sub(r"^(element vertex) \d+$", rf"\1 {count}", " ".join(h.split())) if _counts(h) else h for h in table.header]
+    lines = [
+        re.sub(r"^(element vertex) \d+$", rf"\1 {count}", " ".join(h.split())) if _counts(h) else h
+        for h in table.header
+    ]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
     kept = table.rows[np.asarray(keep, dtype=bool)]
     new = new_rows(table, added) if added is not None and len(added) else None
@@ -124,7 +127,12 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, comments: Sequence[s
     names += [f"f_rest_{k}" for k in range(3 * (bands - 1))] + ["opacity"]
     names += [f"scale_{k}" for k in range(gaussians.log_scales.shape[1])] + [f"rot_{k}" for k in range(4)]
     comments = [*comments, *(["antialiased 1"] if gaussians.antialiased else [])]
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments), "element vertex 0"]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {c}" for c in comments),
+        "element vertex 0",
+    ]
     header += [f"property float {n}" for n in names]
     properties = tuple(PlyProperty(n, "float") for n in names)
     table = PlyTable(tuple(header), "\n", "binary_little_endian", properties, np.zeros(0, f"V{4 * len(names)}"))

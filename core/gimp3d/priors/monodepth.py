@@ -32,7 +32,9 @@ def depth_prior(
         return _from_file(Path(path), kind, height, width)
     if name == "onnx":
         raise BadInput(f"--depth-prior {name}: not in this version; use auto, harmonic, planar or file:PATH")
-    raise BadInput(f"--depth-prior: unknown provider {spec!r}; use auto, harmonic, planar or file:PATH[,disparity|,depth]")
+    raise BadInput(
+        f"--depth-prior: unknown provider {spec!r}; use auto, harmonic, planar or file:PATH[,disparity|,depth]"
+    )
 
 
 def _from_file(path: Path, kind: str, height: int, width: int) -> np.ndarray:

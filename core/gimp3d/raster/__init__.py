@@ -22,9 +22,7 @@ from .blend import blend_range, gather_weights, weigh_range
 from .project import BLUE, FEATURES, RED, TILE, UNUSABLE, project_range
 
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})
-FRUSTUM_MARGIN = (
-    0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
-)
+FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
 
 
 @dataclass(frozen=True)
@@ -46,9 +44,7 @@ class Rendering:
     rgb: np.ndarray  # [H, W, 3] float32, ≥ 0, may exceed 1
     alpha: np.ndarray  # [H, W] float32, accumulated opacity
     expected_depth: np.ndarray  # [H, W] float32, Σ w z / Σ w; 0 where there is nothing
-    median_depth: (
-        np.ndarray
-    )  # [H, W] float32, z of the Gaussian that blocks half of the light; 0 where alpha < 0.5
+    median_depth: np.ndarray  # [H, W] float32, z of the Gaussian that blocks half of the light; 0 where alpha < 0.5
     normals: np.ndarray  # [H, W, 3] float32, unit, camera axes, facing the camera; 0 where there is nothing
     ignored: int  # rows that cannot be drawn (NaN, zero quaternion, …: not `Gaussians.usable`)
 
@@ -129,9 +125,7 @@ def contributions(
     return Contributions(total, peak)
 
 
-def _project_and_bin(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool
-) -> _View:
+def _project_and_bin(gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool) -> _View:
     n = len(gaussians)
     sh = _raw(gaussians.sh)
     features, states = np.empty((n, FEATURES), np.float32), np.empty(n, np.int8)
@@ -187,9 +181,7 @@ def _blend(view: _View, camera: Camera, settings: RasterSettings, passes: frozen
     expected, median = picture(with_depth), picture(with_depth)
     background = np.asarray(settings.background, np.float32)
     flags = with_rgb, with_depth, with_normals
-    _over_tiles(
-        blend_range, view, camera, settings, background, *flags, rgb, alpha, expected, median, normals
-    )
+    _over_tiles(blend_range, view, camera, settings, background, *flags, rgb, alpha, expected, median, normals)
     return Rendering(rgb, alpha, expected, median, normals, view.ignored)
 
 

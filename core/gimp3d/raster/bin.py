@@ -43,9 +43,7 @@ def tile_lists(
     chunks = max(1, min(thread_count(), len(order) // ROWS_PER_CHUNK))
     bounds = [len(order) * k // chunks for k in range(chunks + 1)]
     counts = np.zeros((chunks, across * down), np.int64)
-    parallel_map(
-        lambda k: _count(bounds[k], bounds[k + 1], order, features, across, down, counts[k]), range(chunks)
-    )
+    parallel_map(lambda k: _count(bounds[k], bounds[k + 1], order, features, across, down, counts[k]), range(chunks))
     ends = np.cumsum(counts.T).reshape(across * down, chunks)  # tile by tile, and in a tile chunk by chunk
     places = np.ascontiguousarray(ends.T) - counts
     starts = np.append(places[0], ends[-1, -1])

@@ -40,7 +40,7 @@ def solve_poisson(
     known: np.ndarray,  # [H, W] bool, Dirichlet pixels; only those beside the hole matter
     values: np.ndarray,  # [H, W] or [H, W, C], fixed where known
     guidance: np.ndarray | None = None,  # like values: its 4-neighbour differences are the wanted gradients
-    settings: PoissonSettings = PoissonSettings(),  # noqa: B008
+    settings: PoissonSettings = PoissonSettings(),
     *,
     weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor`
     anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
@@ -94,9 +94,7 @@ def _unanchored(hole: np.ndarray, known: np.ndarray, weight: np.ndarray | None) 
     """[H, W] bool: components of the hole (4-connected) that nothing ties to a value."""
     components, count = scipy.ndimage.label(hole)
     tied = (
-        scipy.ndimage.binary_dilation(known)
-        if weight is None
-        else scipy.ndimage.binary_dilation(known) | (weight > 0)
+        scipy.ndimage.binary_dilation(known) if weight is None else scipy.ndimage.binary_dilation(known) | (weight > 0)
     )
     is_free = np.ones(count + 1, bool)
     is_free[components[tied]] = False
@@ -231,14 +229,10 @@ class _Multigrid:
             mask = (coarse > 0).astype(np.float32)
             self.masks.append(mask)
             self.stencils.append(stencil)
-        self.inverses = [
-            np.where(m > 0, 1 / np.where(m > 0, s[4], 1), 0) for m, s in zip(self.masks, self.stencils)
-        ]
+        self.inverses = [np.where(m > 0, 1 / np.where(m > 0, s[4], 1), 0) for m, s in zip(self.masks, self.stencils)]
         self.stencils[0] = stencil[:, :0, :0]  # the finest is applied from its diagonal alone
         self.diagonal = system.diagonal
-        self.solutions, self.rights, self.residuals = (
-            [np.zeros_like(m) for m in self.masks] for _ in range(3)
-        )
+        self.solutions, self.rights, self.residuals = ([np.zeros_like(m) for m in self.masks] for _ in range(3))
         self.nodes = np.nonzero(mask)
         self.inverse = _pseudo_inverse(stencil, mask)
 
@@ -270,9 +264,7 @@ class _Multigrid:
         if level == 0:
             _residual_five(self.solutions[0], self.rights[0], self.masks[0], self.diagonal, self.residuals[0])
         else:
-            _residual_nine(
-                self.solutions[level], self.rights[level], self.stencils[level], self.residuals[level]
-            )
+            _residual_nine(self.solutions[level], self.rights[level], self.stencils[level], self.residuals[level])
 
 
 def _pseudo_inverse(stencil: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -371,8 +363,7 @@ def _restrict(fine, coarse):
             coarse[I, J] = (
                 fine[i, j]
                 + np.float32(0.5) * (fine[i - 1, j] + fine[i + 1, j] + fine[i, j - 1] + fine[i, j + 1])
-                + np.float32(0.25)
-                * (fine[i - 1, j - 1] + fine[i - 1, j + 1] + fine[i + 1, j - 1] + fine[i + 1, j + 1])
+                + np.float32(0.25) * (fine[i - 1, j - 1] + fine[i - 1, j + 1] + fine[i + 1, j - 1] + fine[i + 1, j + 1])
             )
 
 
@@ -387,9 +378,7 @@ def _prolong(coarse, mask, fine):
             fine[i, j] += mask[i, j] * half * (coarse[I, J] + coarse[I1, J])
         for j in range(2, mask.shape[1] - 1, 2):
             J = j // 2
-            fine[i, j] += (
-                mask[i, j] * quarter * (coarse[I, J] + coarse[I1, J] + coarse[I, J + 1] + coarse[I1, J + 1])
-            )
+            fine[i, j] += mask[i, j] * quarter * (coarse[I, J] + coarse[I1, J] + coarse[I, J + 1] + coarse[I1, J + 1])
 
 
 @kernel

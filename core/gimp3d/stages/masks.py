@@ -36,7 +36,7 @@ class MaskSettings:
     support: float = 0.3  # share of a Gaussian's weight that views must have seen with the object there; 0 keeps all
     support_pixels: float = 0.5  # summed weight below which a Gaussian does not matter
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
-    occluder_step: float = 0.06  # how much nearer (relative) a kept surface at the outline must be to count as in front
+    occluder_step: float = 0.06  # how much nearer (relative) a kept surface counts as in front
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
 
@@ -174,7 +174,7 @@ def find_masks(
     gaussians: Gaussians,
     region: Region,
     cameras: Sequence[Camera],
-    settings: MaskSettings = MaskSettings(),  # noqa: B008
+    settings: MaskSettings = MaskSettings(),
     progress: Progress = silent,
 ) -> Masks:
     """Select the object's Gaussians and find the target region T of every view (paper 3.2; METHOD section 1).
@@ -220,8 +220,8 @@ def find_masks(
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = (
-        f"{len(views)} views see the region; {share:.0%} of its projection needs filling; {int(revealed.sum())} Gaussians "
-        "outside the box go as well: no view saw them unhidden"
+        f"{len(views)} views see the region; {share:.0%} of its projection needs filling; "
+        f"{int(revealed.sum())} Gaussians outside the box go as well: no view saw them unhidden"
     )
     return Masks(removed, tuple(views), left_out, settings.mode, len(views) / len(cameras), reason)
 
@@ -249,7 +249,10 @@ def _measure_view(
     occluder = _in_front(before.median_depth, weight > 0.5, settings)
     if settings.mode == "paper":
         guards = np.any(
-            [guard_gaussians(gaussians, ~removed & gaussians.usable, p, camera, settings.guard_scale) for p in polygons],
+            [
+                guard_gaussians(gaussians, ~removed & gaussians.usable, p, camera, settings.guard_scale)
+                for p in polygons
+            ],
             axis=0,
         )
         covered = render(gaussians.take(guards), camera, raster, frozenset({"alpha"})).alpha
@@ -257,7 +260,14 @@ def _measure_view(
     else:
         target = silhouette
     return ViewMasks(
-        camera, polygon, silhouette, occluder, target & ~occluder, before.median_depth, after.median_depth, after.alpha
+        camera,
+        polygon,
+        silhouette,
+        occluder,
+        target & ~occluder,
+        before.median_depth,
+        after.median_depth,
+        after.alpha,
     )
 
 

@@ -92,7 +92,7 @@ class Propagation:
 def propagate(
     reference: Reference,
     views: Sequence[ViewToPaint],
-    settings: PropagateSettings = PropagateSettings(),  # noqa: B008
+    settings: PropagateSettings = PropagateSettings(),
     progress: Progress = silent,
 ) -> Propagation:
     """Paint the hole of every view by Algorithm 1. Painted views are never sources for others: order is irrelevant."""

@@ -61,7 +61,10 @@ def facing(
 ) -> np.ndarray:
     """cos θ between each surface element and its viewing ray, [H, W] in [0, 1]."""
     rays = np.concatenate(
-        [(camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(depth.shape)[..., None]],
+        [
+            (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy],
+            np.ones(depth.shape)[..., None],
+        ],
         -1,
     )
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -82,7 +85,7 @@ def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
     solid: float = 0.9,
-    settings: ReferenceSettings = ReferenceSettings(),  # noqa: B008
+    settings: ReferenceSettings = ReferenceSettings(),
 ) -> ReferenceChoice:
     """The view that shows most of the needed surface, square on and not cut off by the frame.
 
@@ -106,9 +109,7 @@ def choose_reference(
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
     best, score = usable[0][1], dict(usable)[chosen]
     how = "as asked" if wanted else "sees most of the hidden surface"
-    return ReferenceChoice(
-        chosen, tuple(scores), score / best, f"{chosen}: {how} (score {score:.0f}, best {best:.0f})"
-    )
+    return ReferenceChoice(chosen, tuple(scores), score / best, f"{chosen}: {how} (score {score:.0f}, best {best:.0f})")
 
 
 def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
@@ -119,7 +120,6 @@ def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
     except IllPosed:
         return 0.0
     cosine = facing(view.camera, np.where(view.target, completed.depth, view.depth_after))[view.target].sum()
-    h, w = view.target.shape
     on_border = view.target[0].sum() + view.target[-1].sum() + view.target[:, 0].sum() + view.target[:, -1].sum()
     framed = max(0.0, 1.0 - on_border / max(1.0, 2 * np.sqrt(view.target.sum())))
     return float(cosine * framed**settings.truncation_power)
@@ -148,7 +148,7 @@ def gather_evidence(
     depth: np.ndarray,  # [H, W] its completed z-depth
     target: np.ndarray,  # [H, W] bool, T_0
     views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
-    settings: EvidenceSettings = EvidenceSettings(),  # noqa: B008
+    settings: EvidenceSettings = EvidenceSettings(),
 ) -> Evidence:
     """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.
 
@@ -164,10 +164,10 @@ def gather_evidence(
         open_points = np.flatnonzero(cosine > best)
         clear = sees(other, _without_occluders(seen_depth, settings), points[open_points], settings.tolerance)
         found = open_points[clear]
-        uv, _ = other.project(points[found])
-        colours[found] = cv2.remap(
-            photo, *(uv.astype(np.float32) - 0.5).T[:, :, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[:, 0] if len(found) else colours[found]
+        if len(found):
+            uv, _ = other.project(points[found])
+            x, y = (uv.astype(np.float32) - 0.5).T[:, :, None]
+            colours[found] = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         best[found] = cosine[found]
     image = np.zeros((*target.shape, 3), np.uint8)
     image[rows, cols] = colours

@@ -34,7 +34,7 @@ def seed_gaussians(
     depth: np.ndarray,  # [H, W] completed z-depth
     target: np.ndarray,  # [H, W] bool, T_0
     surfels: bool,
-    settings: SeedSettings = SeedSettings(),  # noqa: B008
+    settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
     """One Gaussian per target pixel with a depth, of SH degree 0: back-projected, aligned with the surface."""
     normals = surface_normals(camera, depth)
@@ -72,7 +72,7 @@ def colour_gaussians(
     views: Sequence[ViewToPaint],
     painted: Sequence[PaintedView],
     scene_degree: int,
-    settings: SeedSettings = SeedSettings(),  # noqa: B008
+    settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
     """The seeds with view-dependent colour fitted to the painted views; c_0 stays what the reference shows."""
     degree = min(settings.sh_degree, scene_degree)

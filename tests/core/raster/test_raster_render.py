@@ -32,9 +32,7 @@ def random_scene(seed: int, count: int = 60, degree: int = 3, surfels: bool = Fa
     )
 
 
-def one(
-    mean=(0.0, 0.0, 2.0), scale=0.1, logit=LOGIT_09, colour=(0.8, 0.5, 0.2), quat=(1, 0, 0, 0)
-) -> Gaussians:
+def one(mean=(0.0, 0.0, 2.0), scale=0.1, logit=LOGIT_09, colour=(0.8, 0.5, 0.2), quat=(1, 0, 0, 0)) -> Gaussians:
     """A single Gaussian of SH degree 0."""
     return Gaussians(
         np.array([mean], np.float32),
@@ -88,9 +86,7 @@ def test_every_sh_degree_matches_the_reference(degree: int) -> None:
 def test_any_scene_size_and_principal_point_match_the_reference(
     seed: int, width: int, height: int, offset: float
 ) -> None:
-    camera = replace(
-        CAMERA, width=width, height=height, cx=width * (0.5 + offset), cy=height * (0.5 - offset / 2)
-    )
+    camera = replace(CAMERA, width=width, height=height, cx=width * (0.5 + offset), cy=height * (0.5 - offset / 2))
     gaussians, reference = random_scene(seed, 30, 1), draw(random_scene(seed, 30, 1), camera)
     drawn = render(gaussians, camera)
     sure = ~reference.doubtful

@@ -42,9 +42,7 @@ def test_the_picture_is_bit_equal_for_any_thread_count(any_thread_count: None) -
     for count in (1, 2, 3, 7):
         threads.set_thread_count(count)
         share = contributions(gaussians, WIDE)
-        results.append(
-            [*arrays(render(gaussians, WIDE)), footprint(gaussians, WIDE, chosen), share.total, share.peak]
-        )
+        results.append([*arrays(render(gaussians, WIDE)), footprint(gaussians, WIDE, chosen), share.total, share.peak])
     for result in results[1:]:
         assert_identical(results[0], result)
 

@@ -1,0 +1,127 @@
+"""The removal benchmark: scenes rendered with and without the object, scored against the truth, beside baselines.
+
+Protocol: the true picture of the first test view is the reference (as in the paper) and is left out of the scores; the
+others are averaged in the mask of what the object hid and in the part of it that no training view sees.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..box import read_region
+from ..commands import output_name, render_views, run_removal, select_cameras
+from ..errors import BadInput
+from ..io.cameras import read_cameras
+from ..io.images import read_image, read_mask, write_png
+from ..io.ply import read_ply, write_ply
+from ..job import RemovalJob
+from ..progress import Progress, silent
+from ..stages.masks import select_removed
+from .metrics import evaluate_folders
+
+MASKS = {"mask": ".mask.png", "unseen": ".unseen.png"}
+DILATION = 3  # px by which Telea's mask is grown on the photo with the object
+BASELINES = ("hole open", "telea")
+
+
+def run_benchmark(
+    data: Path,
+    out: Path,
+    scenes: Sequence[str] = (),
+    presets: Sequence[str] = ("balanced",),
+    progress: Progress = silent,
+) -> list[dict[str, Any]]:
+    """Run every scene below `data` with every preset and baseline; one row of scores each.
+
+    Raises
+    ------
+    BadInput
+        If `data` holds no scene with `truth/`.
+    """
+    names = list(scenes) or sorted(p.parent.name for p in data.glob("*/truth") if (p.parent / "scene.ply").exists())
+    if not names or not all((data / n / "truth").is_dir() for n in names):
+        raise BadInput(f"bench: {data} holds no scene folders with scene.ply, transforms.json, roi.json and truth/")
+    methods = (*BASELINES, *presets)
+    rows = []
+    for k, name in enumerate(names):
+        for m, method in enumerate(methods):
+            progress("bench", k * len(methods) + m, len(names) * len(methods), f"{name}: {method}")
+            rows.append(_run(data / name, out / name / method.replace(" ", "_"), method))
+    progress("bench", 1, 1, "done")
+    return rows
+
+
+def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
+    cameras = select_cameras(read_cameras(scene / "transforms.json"), "test")
+    reference, start = cameras[0], time.perf_counter()
+    added = 0
+    if method == "telea":
+        for camera in cameras[1:]:
+            _telea(scene, camera.id, out / "render")
+    else:
+        if method == "hole open":
+            file = read_ply(scene / "scene.ply")
+            write_ply(out / "out.ply", file, ~select_removed(file.gaussians, read_region(scene / "roi.json")))
+        else:
+            job = RemovalJob(
+                scene=str(scene / "scene.ply"),
+                cameras=str(scene / "transforms.json"),
+                roi=str(scene / "roi.json"),
+                out=str(out / "out.ply"),
+                reference=reference.id,
+                reference_image=str(scene / reference.id),
+                preset=method,
+            )
+            added = run_removal(job)["counts"]["added"]
+    seconds = time.perf_counter() - start
+    if method != "telea":
+        render_views(out / "out.ply", scene / "transforms.json", out / "render", split="test")
+    row: dict[str, Any] = {"scene": scene.name, "method": method, "seconds": seconds, "added": added}
+    folder = Path(output_name(reference.id)).parent
+    for key, suffix in MASKS.items():
+        scores = evaluate_folders(
+            out / "render" / folder,
+            scene / folder,
+            scene / "truth" / folder,
+            suffix,
+            (Path(reference.id).name,),
+        )
+        row |= {f"{metric} {key}": value for metric, value in scores["mean"].items()}
+    return row
+
+
+def _telea(scene: Path, camera_id: str, out: Path) -> None:
+    """OpenCV's Telea on the test photo with the object, the true mask dilated."""
+    stem = Path(camera_id).stem
+    photo = read_image(scene / "images" / f"with_test_{stem}.png")
+    mask = read_mask(scene / "truth" / "test" / f"{stem}.mask.png").astype(np.uint8)
+    grown = cv2.dilate(mask, np.ones((2 * DILATION + 1,) * 2, np.uint8))
+    write_png(out / f"{output_name(camera_id)}.png", cv2.inpaint(photo, grown, 3, cv2.INPAINT_TELEA))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The scores as a Markdown table, with the mean over scenes of each method."""
+    keys = [f"{metric} {mask}" for mask in MASKS for metric in ("psnr", "ssim", "flip")]
+    lines = [
+        "| scene | method | PSNR mask | SSIM | FLIP | PSNR unseen | SSIM | FLIP | added | seconds |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    methods = list(dict.fromkeys(r["method"] for r in rows))
+    means = [
+        {"scene": "**mean**", "method": m}
+        | {k: float(np.mean([r[k] for r in rows if r["method"] == m])) for k in (*keys, "added", "seconds")}
+        for m in methods
+    ]
+    for row in [*rows, *means]:
+        numbers = [f"{row[k]:.2f}" if k.startswith("psnr") else f"{row[k]:.3f}" for k in keys]
+        extra = [f"{row['added']:.0f}", f"{row['seconds']:.1f}"]
+        if row["method"] in BASELINES:
+            extra = ["", ""]  # no removal was run: times would compare nothing
+        lines.append(f"| {row['scene']} | {row['method']} | {' | '.join([*numbers, *extra])} |")
+    return "\n".join(lines)
