@@ -57,7 +57,8 @@ def camera_from_blender(
 ) -> Camera:
     """A Blender camera in the splat's frame, as the scene's render settings frame it.
 
-    Sensor fit, shift, pixel aspect and resolution percentage come out of Blender's own projection matrix.
+    Sensor fit, shift, pixel aspect and resolution percentage come out of Blender's own projection matrix. A frame of an
+    animated camera has a `name`. An imported camera keeps its exact intrinsics, and its photo while it stays in place.
 
     Raises
     ------
@@ -79,10 +80,11 @@ def camera_from_blender(
     if CAMERA in obj:
         stored = json.loads(obj[CAMERA])
         distortion = Distortion(*stored["distortion"]) if stored["distortion"] else None
-        image = Path(stored["image"]) if stored["image"] else None
+        there = name is None and not _moved(viewmat, np.array(stored["viewmat"]), frame)
+        image = Path(stored["image"]) if stored["image"] and there else None
         size = (stored["width"], stored["height"])
         intrinsics = (stored["fx"], stored["fy"], stored["cx"], stored["cy"])
-        return Camera(name or stored["id"], *size, *intrinsics, viewmat, "train", image, distortion)
+        return Camera(name or stored["id"], *size, *intrinsics, viewmat, stored["split"], image, distortion)
     render = scene.render
     width = max(1, int(render.resolution_x * render.resolution_percentage / 100))
     height = max(1, int(render.resolution_y * render.resolution_percentage / 100))
@@ -92,6 +94,18 @@ def camera_from_blender(
     fx, fy = width / 2 * p[0][0], height / 2 * p[1][1]
     cx, cy = width / 2 * (1 - p[0][2]), height / 2 * (1 + p[1][2])
     return Camera(name or safe_name(obj.name), width, height, fx, fy, cx, cy, viewmat)
+
+
+def has_photo(obj: bpy.types.Object) -> bool:
+    """Whether a camera was imported with a photo, even if it has been moved away from it since."""
+    return CAMERA in obj and json.loads(obj[CAMERA])["image"] is not None
+
+
+def _moved(viewmat: np.ndarray, imported: np.ndarray, frame: np.ndarray) -> bool:
+    """Whether a camera left the place where its photo was taken, by more than Blender's float32 does."""
+    reach = np.linalg.norm(imported[:3, 3]) + np.linalg.norm(np.linalg.inv(frame)[:3, 3])
+    step = (viewmat @ np.linalg.inv(imported)) - np.eye(4)
+    return bool(np.abs(step[:3, :3]).max() > 1e-4 or np.linalg.norm(step[:3, 3]) > 1e-4 * reach)
 
 
 def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
@@ -114,6 +128,8 @@ def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
             "fy": camera.fy,
             "cx": camera.cx,
             "cy": camera.cy,
+            "split": camera.split,
+            "viewmat": camera.viewmat.tolist(),
             "distortion": camera.distortion.coefficients.tolist() if camera.distortion else None,
             "image": str(camera.image.resolve()) if camera.image and camera.image.exists() else None,
         }

@@ -58,9 +58,8 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     frame = bridge.splat_frame(splat)
     region = [bridge.box_from_blender(b, frame).to_json() for b in boxes]
     wanted, reference = bridge.present(context.scene, settings.reference), ""
-    cameras: list[Camera] = []
-    for camera, obj in bridge.views_of(context, frame):
-        cameras.append(camera)
+    views = list(bridge.views_of(context, frame))
+    for camera, obj in views:
         if wanted is not None and obj == wanted and not reference:
             reference = camera.id
     picture = bpy.path.abspath(settings.reference_image) if settings.reference_image else ""
@@ -71,7 +70,7 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
-    write_transforms(folder / "transforms.json", [_with_photo(c, folder) if with_photos else c for c in cameras])
+    write_transforms(folder / "transforms.json", [_with_photo(c, folder) if with_photos else c for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
         shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")
@@ -80,7 +79,7 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
         cameras=str(folder / "transforms.json"),
         roi=str(folder / "roi.json"),
         out=str(folder / "out.ply"),
-        images=None if any(c.image for c in cameras) else "none",
+        images=None if any(bridge.has_photo(obj) for _, obj in views) else "none",
         reference=reference or None,
         reference_image=str(folder / f"reference{Path(picture).suffix}") if picture else None,
         inpaint=settings.inpaint,

@@ -46,7 +46,7 @@ class GIMP3D_OT_add_roi(ReportsErrors, bpy.types.Operator):
         """A fifth of where most splats lie: stray ones far off do not count."""
         mesh = splat.data
         points = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.attributes["position"].data.foreach_get("vector", points)
+        mesh.vertices.foreach_get("co", points)
         if len(points) == 0:
             return 1.0
         low, high = np.percentile(points.reshape(-1, 3), [10, 90], axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -204,3 +205,33 @@ def test_photos_go_with_the_job_and_imported_sizes_win(splat: bpy.types.Object, 
     assert job.images is None and {(c.width, c.height) for c in views} == {SIZE}
     assert [c.id for c in views if c.image.exists()] == ["orbit/000"]
     assert views[0].image.read_bytes() == (photos / "orbit" / "000.png").read_bytes()
+
+
+def test_a_camera_that_was_moved_leaves_its_photo_behind(splat: bpy.types.Object, tmp_path: Path) -> None:
+    write_png(tmp_path / "orbit" / "000.png", np.full((SIZE[1], SIZE[0], 3), 77, np.uint8))
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    obj = bpy.context.scene.gimp3d.view_collection.objects["orbit/000.001"]
+
+    def photo() -> Path | None:
+        bpy.context.view_layer.update()
+        return next(c for c, o in bridge.views_of(bpy.context, bridge.splat_frame(splat)) if o == obj).image
+
+    assert photo() == tmp_path / "orbit" / "000.png"
+    obj.location.x += 0.01
+    assert photo() is None and jobs.write_job(bpy.context, tmp_path / "job").images is None
+    obj.location.x -= 0.01
+    assert photo() is not None
+    splat.location.x = 1  # the cameras stay where they are, so they look elsewhere in the scene now
+    assert photo() is None
+
+
+def test_the_split_goes_through_blender(splat: bpy.types.Object, tmp_path: Path) -> None:
+    views = [replace(c, split="test" if k % 2 else "train") for k, c in enumerate(cameras())]
+    write_transforms(tmp_path / "split.json", views)
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "split.json"), split="all")
+    assert [c.split for c, _ in bridge.views_of(bpy.context, np.eye(4))] == [c.split for c in views]
+
+
+def test_a_box_can_be_added_to_an_empty_scene(few_gaussians: Gaussians, import_scene) -> None:
+    import_scene(few_gaussians.take(np.arange(0)))
+    assert bpy.ops.gimp3d.add_roi() == {"FINISHED"} and bpy.context.object.scale.x == 1
