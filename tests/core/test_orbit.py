@@ -1,0 +1,36 @@
+"""Cameras round a region."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gimp3d.box import Box
+from gimp3d.errors import BadInput
+from gimp3d.orbit import orbit_cameras
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -2, 0.5)])
+def test_all_cameras_frame_the_region_from_above_and_outside(up: tuple[float, float, float]) -> None:
+    boxes = (Box.make([5, 1, -2], [1, 2, 0.5], [0.9, 0.1, 0.3, 0.2]), Box.make([6, 1, -2], [1, 1, 1]))
+    axis = np.array(up) / np.linalg.norm(up)
+    cameras = orbit_cameras(boxes, 11, up, 320, 200, 60)
+    assert len({c.id for c in cameras}) == 11 and all(c.split == "train" for c in cameras)
+    corners = np.concatenate([b.corners() for b in boxes])
+    for camera in cameras:
+        uv, z = camera.project(corners)
+        assert (z > 0).all() and (uv >= 0).all() and (uv < [320, 200]).all()
+        assert (camera.centre - corners.mean(0)) @ axis > 0
+        assert not any(b.contains(camera.centre[None])[0] for b in boxes)
+        np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(camera.R) == pytest.approx(1)
+        assert camera.R[1] @ axis < 0  # the picture is upright: its y axis points down
+        assert 2 * np.degrees(np.arctan(160 / camera.fx)) == pytest.approx(60)
+
+
+@pytest.mark.parametrize(
+    "change", [{"up": (0, 0, 0)}, {"count": 0}, {"fov_degrees": 0.5}, {"fov_degrees": 180}, {"width": 0}, {"up": (np.nan, 0, 0)}]
+)
+def test_senseless_orbits_are_refused(change: dict) -> None:
+    with pytest.raises(BadInput, match="orbit"):
+        orbit_cameras((Box.make([0, 0, 0], [1, 1, 1]),), **change)
