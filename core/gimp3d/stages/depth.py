@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -11,7 +12,9 @@ import scipy.ndimage
 from ..errors import IllPosed
 from ..solvers.poisson import solve_poisson
 
-SQUARE = np.ones((3, 3), bool)  # 8-neighbours
+ON = 1
+SIG = 6
+AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
 
 
 @dataclass(frozen=True)
@@ -21,20 +24,20 @@ class DepthSettings:
     surface: str = "auto"  # "auto": planes where the ring shows them, else harmonic; "planar", "harmonic" insist
     plane_ring: int = 24  # width of the ring on which planes are sought
     plane_inlier: float = 0.008  # difference up to which a ring pixel lies on a plane
-    plane_share: float = 0.5  # of the ring that must lie on planes
-    planes: int = 3  # at most: a floor and two walls
-    least_plane: float = 0.08  # of the ring that a plane must hold
+    plane_share: float = 0.65  # of the ring that must lie on planes
+    most_planes: int = 3  # a floor and two walls
+    least_plane: float = 0.08  # share of the ring that a plane must hold
     plane_tries: int = 256  # RANSAC samples per plane
-    junction: float = 0.95  # of two planes' ring pixels that max (or min) must explain for them to meet in the hole
-    least_layer: float = 0.1  # of the rim that something off the planes must hold to reach into the hole
+    junction: float = 0.95  # share of two planes' ring pixels that max or min must explain for them to meet
+    least_layer: float = 0.1  # share of the rim that what is on no plane must hold to reach into the hole
     scale_factor: float | None = None  # s_f; None: measured on the ring. The paper uses 0.1
     ring: int = 12  # width of the ring on which s_f is measured
     gradient_step: int = 6  # differences over this distance suffer least from a prior's noise (research, K2)
     minimum_ring: int = 10  # ring pixels below which nothing can be measured
-    minimum_correlation: float = 0.3  # between the prior's and the scene's gradients
-    layer_jump: float = 0.06  # step between neighbours on the rim that parts two layers
+    minimum_correlation: float = 0.2  # between the prior's and the scene's gradients
+    layer_jump: float = 0.06  # step on the rim that parts two layers
     layer_band: int = 4  # width of the ring on which layers are told apart
-    occluder_share: float = 0.4  # of the rim: a nearer layer that holds more is what the object stood on
+    occluder_share: float = 0.4  # of the rim; a nearer layer that holds more is what the object stood on
     low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
     high: float = 4.0
 
@@ -60,51 +63,325 @@ def complete_disparity(
 ) -> DepthCompletion:
     """Fill a hole in a disparity map in the gradient domain (paper 3.3).
 
-    Solves Δd = s_f Δd_m on the hole with d fixed on its known rim and natural boundaries elsewhere; the printed
-    divergence has the opposite sign (METHOD section 3). Without a prior, planes that the surroundings lie on are
-    continued (`planar_surfaces`), and what is on none of them is completed harmonically. Sky on the rim keeps its
-    own part of the hole, and layers in front of it are no boundary (`background_rim`): nothing smears.
-    Known pixels that are NaN, infinite or negative are not known.
-
-    A part of the hole without a known rim takes the aligned prior, or else the nearest depth.
+    Solves Δd = s_f Δd_m on the hole with d fixed on its known rim and natural boundaries elsewhere; the
+    printed divergence has the opposite sign (METHOD section 3). Without a prior, planes on which the
+    surroundings lie are continued (`planar_surfaces`) and the rest is harmonic. Nothing smears across layers:
+    rims of occluders are no boundary (`background_rim`), and sky keeps a part of the hole to itself.
+    Known pixels that are NaN, infinite or negative are not known. A part of the hole that has no rim takes the
+    prior, aligned to the ring, or the nearest depth.
 
     Raises
     ------
     IllPosed
-        If the hole has no known rim at all and no prior that fits what is known; or if planes were insisted on and
-        there are none.
+        If the hole has no known rim at all and no prior that fits what is known; or if planes were insisted
+        on and there are none.
     """
     with np.errstate(invalid="ignore"):
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
-        return _report(scene, 0.0, 0, 1.0, "nothing to fill")
-    window = _window(hole, settings.plane_ring + 2)
-    if not (trusted[window] & scipy.ndimage.binary_dilation(hole[window])).any():
-        return _align_prior(scene, trusted, hole, prior, settings)
-    view = scene[window], trusted[window], hole[window]
-    rim = background_rim(*view, settings)
+        return _completion(scene, 0.0, 0, 1.0, "nothing to fill")
+    rim = background_rim(scene, trusted, hole, settings)
+    touches = bool((rim & scipy.ndimage.binary_dilation(hole)).any())
+    fit, planes = PriorFit(0.0, 0.0, 0.7, "harmonic"), None
     if prior is not None:
-        scale, confidence, reason = measure_scale(view[0], rim, view[2], prior[window], settings)
-        filled = _fill(view[0], rim, view[2], [], scale * prior[window] if scale else None, settings)
-    else:
-        surfaces, share = [], 0.0
-        if settings.surface != "harmonic":
-            surfaces, share = planar_surfaces(view[0], rim, view[2], settings)
-        if settings.surface == "planar" and share < settings.plane_share:
-            raise IllPosed(f"depth: only {share:.0%} of the surroundings lie on planes; use --depth-prior auto")
-        scale, confidence, reason = 0.0, 0.7, "harmonic"
-        if share >= settings.plane_share:
-            confidence, reason = share, f"planar: {share:.0%} of the surroundings lie on {_counted(surfaces)}"
-        filled = _fill(view[0], rim, view[2], surfaces if share >= settings.plane_share else [], None, settings)
-    return None
+        fit = fit_prior(scene, rim, hole, prior, settings, near_the_hole=touches)
+    elif settings.surface != "harmonic":
+        planes = planar_surfaces(scene, rim, hole, settings)
+        if planes.share >= settings.plane_share:
+            fit = PriorFit(0.0, 0.0, planes.share, planes.reason)
+        elif settings.surface == "planar":
+            raise IllPosed(f"depth: {planes.reason}, too few for planes; use --depth-prior auto")
+        else:
+            planes = None
+    if not touches and fit.scale == 0:
+        raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
+    guidance = fit.scale * prior + fit.shift if prior is not None and fit.scale else None
+    filled = _fill(scene, rim, hole, planes.surfaces if planes else (), guidance, settings)
+    return _settled(filled, scene, rim, hole, fit, settings)
+
+
+@dataclass(frozen=True)
+class PriorFit:
+    """How a relative prior turns into the scene's disparity: scale · prior + shift. Scale 0: not at all."""
+
+    scale: float  # s_f
+    shift: float  # matters only where the hole has no rim
+    confidence: float
+    reason: str
+
+
+def fit_prior(
+    disparity: np.ndarray,  # [H, W]
+    known: np.ndarray,  # [H, W] bool
+    hole: np.ndarray,  # [H, W] bool
+    prior: np.ndarray,  # [H, W] relative disparity
+    settings: DepthSettings = DepthSettings(),
+    near_the_hole: bool = True,  # measure on the ring; else on everything known
+) -> PriorFit:
+    """Measure s_f by least squares between gradients on the ring (METHOD section 3).
+
+    With a noisy prior the best s_f is below the true gain, which is what least squares gives. 0 where the prior
+    says nothing: too few pixels, no variance, no or negative agreement.
+    """
+    ring = known & (disparity > 0) & np.isfinite(prior)
+    if near_the_hole:
+        ring &= _distance(hole) <= settings.ring
+    k, pairs = settings.gradient_step, []
+    for near, far in ((np.s_[:, :-k], np.s_[:, k:]), (np.s_[:-k], np.s_[k:])):
+        both = ring[near] & ring[far]
+        pairs.append(np.stack([(prior[far] - prior[near])[both], (disparity[far] - disparity[near])[both]]))
+    m, d = np.concatenate(pairs, axis=1).astype(np.float64)
+    if len(m) < settings.minimum_ring:
+        return PriorFit(0.0, 0.0, 0.3, "harmonic: too little is known round the hole to scale the prior")
+
+    def fitted(scale: float, confidence: float, reason: str) -> PriorFit:
+        return PriorFit(scale, float(np.median((disparity - scale * prior)[ring])), confidence, reason)
+
+    if settings.scale_factor is not None:
+        return fitted(settings.scale_factor, 0.5, f"guided, s_f = {settings.scale_factor:g} as set")
+    if (m**2).mean() < 1e-12 * max(float(np.abs(prior[ring]).max()) ** 2, 1e-300):
+        return PriorFit(0.0, 0.0, 0.3, "harmonic: the prior is constant round the hole")
+    scale = float((m * d).sum() / (m**2).sum())
+    correlation = float((m * d).sum() / np.sqrt((m**2).sum() * max((d**2).sum(), 1e-300)))
+    if correlation < settings.minimum_correlation:
+        reason = f"harmonic: the prior does not fit the scene (correlation {correlation:.2f})"
+        return PriorFit(0.0, 0.0, 0.3, reason)
+    words = f"guided, s_f = {scale:.3g} measured on the ring (correlation {correlation:.2f})"
+    return fitted(scale, correlation, words)
 
 
 def background_rim(
-    disparity: np.ndarray,  # [H, W] float64
+    disparity: np.ndarray,  # [H, W]
     known: np.ndarray,  # [H, W] bool
     hole: np.ndarray,  # [H, W] bool
     settings: DepthSettings = DepthSettings(),
 ) -> np.ndarray:
-    """[H, W] bool: the known pixels that may bound the hole, without the rims of occluders in front of it."""
-    ...
+    """[H, W] bool: the known pixels that may bound the hole, that is, not those of occluders in front of it.
+
+    Layers are the parts of the band round the hole between jumps. One that ends at a jump, lies in front of the
+    largest and holds little of the rim is an occluder: the farther layer goes on behind it (METHOD section 3).
+    Surfaces that meet, as a floor and a wall, have no jump between them, however steep.
+    """
+    distance = _distance(hole)
+    band = known & (distance <= settings.layer_band)
+    jumps = _jumps(disparity, known, band, settings.layer_jump)
+    layers, count = scipy.ndimage.label(band & ~jumps, AROUND)
+    if count < 2 or not jumps.any():
+        return known
+    numbers = np.arange(1, count + 1)
+    sizes = scipy.ndimage.sum_labels(distance < 2, layers, numbers)
+    heights = scipy.ndimage.median(disparity, layers, numbers)
+    beside_jump = np.isin(numbers, layers[scipy.ndimage.binary_dilation(jumps, AROUND)])
+    nearer = (1 + settings.layer_jump) * heights[np.argmax(sizes)]
+    occluder = beside_jump & (heights > nearer) & (sizes < settings.occluder_share * sizes.sum())
+    dropped = np.isin(layers, numbers[occluder]) | (jumps & (disparity > nearer) & occluder.any())
+    return known & ~dropped
+
+
+def _jumps(disparity: np.ndarray, known: np.ndarray, band: np.ndarray, threshold: float) -> np.ndarray:
+    """[H, W] bool: pixels of the band within 2 px of a step.
+
+    The measure is the second difference over ±2 px, which is 0 on planes at any slant and the step's height at a
+    step, also one blurred over a pixel or two.
+    """
+    padded = np.pad(np.where(known, disparity, np.nan), 2, constant_values=np.nan)
+    h, w = disparity.shape
+    found = np.zeros(disparity.shape, bool)
+    with np.errstate(invalid="ignore"):
+        for dy, dx in ((0, 2), (2, 0), (2, 2), (2, -2)):
+            after = padded[2 + dy : 2 + dy + h, 2 + dx : 2 + dx + w]
+            before = padded[2 - dy : 2 - dy + h, 2 - dx : 2 - dx + w]
+            found |= np.abs(before + after - 2 * disparity) > threshold * np.maximum(before, after)
+    return found & band
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A part of the background that planes describe: one, or some that meet in a line."""
+
+    disparity: np.ndarray  # [H, W] float64, continued over the whole image
+    on: np.ndarray  # [H, W] bool, the ring's pixels on it
+    planes: int = 1
+
+
+@dataclass(frozen=True)
+class PlanarSurfaces:
+    """What of the hole's surroundings is planar."""
+
+    surfaces: tuple[Surface, ...]
+    share: float  # of the ring that lies on them
+    reason: str
+
+
+def planar_surfaces(
+    disparity: np.ndarray,  # [H, W]; 0 = sky
+    known: np.ndarray,  # [H, W] bool
+    hole: np.ndarray,  # [H, W] bool
+    settings: DepthSettings = DepthSettings(),
+) -> PlanarSurfaces:
+    """The planes d = a·u + b·v + c on which the ring round the hole lies, largest first; sky is the plane d = 0.
+
+    A plane in space is exactly affine in disparity, whatever the camera. Sequential RANSAC (Fischler & Bolles
+    1981) with a fixed seed, each plane refined by least squares. Only planes that touch the hole count. Two that
+    the ring shows to meet become one surface: the nearer one where they are concave (a room seen from inside:
+    max of disparities), the farther where convex (min).
+    """
+    distance = _distance(hole)
+    ring = known & (distance <= settings.plane_ring)
+    rim = known & (distance < 2)
+    sky = ring & (disparity == 0)
+    left = ring & ~sky
+    rng = np.random.default_rng(0)
+    found = [Surface(np.zeros(hole.shape), sky)] if sky.any() else []
+    for _ in range(settings.most_planes):
+        plane = _largest_plane(disparity, left, settings, rng)
+        if plane is None:
+            break
+        near = left & (np.abs(plane - disparity) < settings.plane_inlier * disparity)
+        # Where a plane merely cuts through rough ground, its inliers are scattered.
+        inliers, candidates = (cv2.boxFilter(a.astype(np.float32), -1, (7, 7)) for a in (near, left))
+        on = near & (inliers > 0.6 * candidates)
+        left &= ~near
+        if on.sum() < settings.least_plane * ring.sum():
+            break
+        found.append(Surface(plane, on))
+    share = float(sum(s.on.sum() for s in found) / max(1, ring.sum()))
+    planes = sum(s.disparity.any() for s in found)
+    reason = f"planar: {share:.0%} of the surroundings lie on {planes} plane{'s' if planes != 1 else ''}"
+    touching = [s for s in found if (s.on & rim).sum() > 0.03 * rim.sum()]
+    return PlanarSurfaces(tuple(_joined(touching, settings)), share, reason)
+
+
+def _largest_plane(
+    disparity: np.ndarray, ring: np.ndarray, settings: DepthSettings, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The plane [H, W] that most ring pixels lie on."""
+    rows, cols = np.nonzero(ring)
+    if len(rows) < max(3, settings.minimum_ring):
+        return None
+    # Divided by d, residuals are relative.
+    d = disparity[rows, cols]
+    points = np.stack([cols, rows, np.ones(len(rows))], -1) / d[:, None]
+    samples = rng.integers(0, len(rows), (settings.plane_tries, 3))
+    solvable = np.abs(np.linalg.det(points[samples] * d[samples][..., None])) > 1.0  # not three pixels in a line
+    if not solvable.any():
+        return None
+    candidates = np.linalg.solve(points[samples[solvable]], np.ones((solvable.sum(), 3, 1)))[..., 0]
+    thinned = points[:: max(1, len(points) // 2000)]
+    votes = (np.abs(thinned @ candidates.T - 1) < settings.plane_inlier).sum(0)
+    best = candidates[int(votes.argmax())]
+    for _ in range(3):
+        on = np.abs(points @ best - 1) < settings.plane_inlier
+        if on.sum() < 3:
+            return None
+        best = np.linalg.lstsq(points[on], np.ones(on.sum()), rcond=None)[0]
+    v, u = np.mgrid[: ring.shape[0], : ring.shape[1]]
+    return best[0] * u + best[1] * v + best[2]
+
+
+def _joined(surfaces: list[Surface], settings: DepthSettings) -> list[Surface]:
+    """The surfaces, with those that meet made one."""
+    for a, b in combinations(surfaces, 2):
+        for meet in (np.maximum, np.minimum):
+            joint = meet(a.disparity, b.disparity)
+            kept = [
+                (np.abs(joint - s.disparity) <= settings.plane_inlier * np.abs(s.disparity))[s.on].mean()
+                for s in (a, b)
+            ]
+            if min(kept) >= settings.junction:
+                others = [s for s in surfaces if s is not a and s is not b]
+                return _joined([Surface(joint, a.on | b.on, a.planes + b.planes), *others], settings)
+    return surfaces
+
+
+def _fill(
+    disparity: np.ndarray,
+    rim: np.ndarray,
+    hole: np.ndarray,
+    surfaces: tuple[Surface, ...],
+    guidance: np.ndarray | None,
+    settings: DepthSettings,
+) -> np.ndarray:
+    """Disparity [H, W] float64 in the hole, NaN where nothing says anything.
+
+    Each surface gets the part of the hole that is nearest to its rim in the harmonic sense.
+    """
+    rim = rim & scipy.ndimage.binary_dilation(hole)
+    if not surfaces and (rim & (disparity == 0)).any():
+        surfaces = (Surface(np.zeros(hole.shape), rim & (disparity == 0)),)
+    rest = len(surfaces)
+    layer = np.full(hole.shape, -1)
+    layer[rim] = rest
+    for k, surface in reversed(list(enumerate(surfaces))):
+        most = settings.layer_jump * np.maximum(disparity, surface.disparity)
+        layer[rim & (np.abs(disparity - surface.disparity) <= most)] = k
+    if rest and (layer == rest).sum() < settings.least_layer * rim.sum():
+        layer[layer == rest] = -1
+    present = np.unique(layer[layer >= 0])
+    part = np.full(hole.shape, present[0] if len(present) else rest)
+    if len(present) > 1:
+        votes = solve_poisson(hole, layer >= 0, (layer[..., None] == present).astype(np.float64)).values
+        part = present[np.nan_to_num(votes).argmax(-1)]
+    loose = hole & (part == rest)
+    filled = np.where(loose, solve_poisson(loose, layer == rest, disparity, guidance).values, np.nan)
+    if rest:
+        planar = np.choose(np.clip(part, 0, rest - 1), [s.disparity for s in surfaces])
+        base = np.choose(np.clip(layer, 0, rest - 1), [s.disparity for s in surfaces])
+        on_planes = (layer >= 0) & (layer < rest)
+        dist = _distance(hole)
+        ring = (dist > 0) & (dist <= settings.plane_ring)
+        num = np.zeros(hole.shape)
+        den = np.zeros(hole.shape)
+        for k, sf in enumerate(surfaces):
+            on = sf.on & (np.abs(disparity - sf.disparity) <= ON * settings.plane_inlier * disparity)
+            n_ = cv2.GaussianBlur(np.where(on, disparity - sf.disparity, 0), (0, 0), SIG)
+            d_ = cv2.GaussianBlur(on.astype(float), (0, 0), SIG)
+            num = np.where(layer == k, n_, num)
+            den = np.where(layer == k, d_, den)
+        ok = on_planes & (den > 0.02)
+        deviation = solve_poisson(hole, ok, num / np.maximum(den, 1e-9)).values
+        filled = np.where(hole & ~loose, planar + np.nan_to_num(deviation), filled)
+    return filled
+
+
+def _settled(
+    filled: np.ndarray,
+    scene: np.ndarray,
+    rim: np.ndarray,
+    hole: np.ndarray,
+    fit: PriorFit,
+    settings: DepthSettings,
+) -> DepthCompletion:
+    """The result with every pixel decided and kept to the ring's range."""
+    confidence, reason = fit.confidence, fit.reason
+    ring = scene[rim & (_distance(hole) <= settings.layer_band)]
+    if not len(ring):
+        ring = scene[rim]
+    undecided = hole & ~np.isfinite(filled)
+    if undecided.any():
+        nearest = scipy.ndimage.distance_transform_edt(~rim, return_distances=False, return_indices=True)
+        filled = np.where(undecided, scene[tuple(nearest)], filled)
+        confidence, reason = min(confidence, 0.3), f"{reason}; a part of the hole has no rim: nearest depth used"
+    sky = bool((ring == 0).any())
+    ring = ring[ring > 0]
+    low, high = (settings.low * ring.min(), settings.high * ring.max()) if len(ring) else (0.0, 0.0)
+    if sky:  # what the ring shows to be that far is infinitely far
+        filled = np.where(filled < low, 0.0, np.minimum(filled, high))
+        clamped = 0
+    kept = filled if sky else np.clip(filled, low, high)
+    clamped = int((hole & (kept != filled)).sum())
+    if clamped > 0.05 * hole.sum():
+        confidence, reason = confidence * 0.5, f"{reason}; {clamped} pixels clamped to the ring's range"
+    return _completion(np.where(hole, kept, scene), fit.scale, clamped, confidence, reason)
+
+
+def _completion(disparity: np.ndarray, scale: float, clamped: int, confidence: float, reason: str) -> DepthCompletion:
+    disparity = disparity.astype(np.float32)
+    depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
+    return DepthCompletion(disparity, depth, scale, clamped, confidence, reason)
+
+
+def _distance(hole: np.ndarray) -> np.ndarray:
+    """[H, W] float32: distance to the hole in pixels, 0 inside."""
+    return cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
