@@ -5,6 +5,7 @@ Writes build/demo/demo.blend, before and after pictures and the report. Run by `
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -14,7 +15,6 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-OUT = ROOT / "build" / "demo"
 SCENE = ROOT / "assets" / "demo"
 os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="gimp3d-demo-")  # the user's own Blender stays as it is
 sys.path.insert(0, str(ROOT))
@@ -31,17 +31,20 @@ from gimp3d.pipeline import render_bytes
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "demo")
+    out = parser.parse_args().out.resolve()
     start = time.perf_counter()
-    shutil.rmtree(OUT, ignore_errors=True)
-    OUT.mkdir(parents=True)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
     bpy.ops.wm.read_homefile(use_empty=True)
     gimp3d_addon.register()
     try:
-        remove_the_vase()
+        remove_the_vase(out)
     finally:
         gimp3d_addon.unregister()
-    pictures()
-    shown = OUT.relative_to(ROOT)
+    pictures(out)
+    shown = out.relative_to(ROOT) if out.is_relative_to(ROOT) else out
     print(f"done in {time.perf_counter() - start:.0f} s. Look at:")
     for name, what in (
         ("before_after.png", "before and after"),
@@ -52,9 +55,9 @@ def main() -> None:
         print(f"  {shown / name}  {what}")
 
 
-def remove_the_vase() -> None:
+def remove_the_vase(out: Path) -> None:
     """What an artist does, by script."""
-    blend = str(OUT / "demo.blend")
+    blend = str(out / "demo.blend")
     bpy.ops.wm.save_as_mainfile(filepath=blend, check_existing=False)
     say("importing the scene")
     bpy.ops.gimp3d.import_ply(filepath=str(SCENE / "scene.ply"))
@@ -64,25 +67,25 @@ def remove_the_vase() -> None:
     bpy.ops.gimp3d.import_cameras(filepath=str(SCENE / "transforms.json"))
     say("removing the vase (the first run compiles the kernels, some seconds)")
     bpy.ops.gimp3d.remove_object()
-    bpy.ops.gimp3d.export_ply(filepath=str(OUT / "out.ply"))
+    bpy.ops.gimp3d.export_ply(filepath=str(out / "out.ply"))
     report = Path(bpy.context.scene.gimp3d.last_report).parent
-    shutil.copytree(report, OUT / "report")
-    bpy.context.scene.gimp3d.last_report = str(OUT / "report" / "index.html")
+    shutil.copytree(report, out / "report")
+    bpy.context.scene.gimp3d.last_report = str(out / "report" / "index.html")
     bpy.ops.wm.save_as_mainfile(filepath=blend, check_existing=False)
 
 
-def pictures() -> None:
+def pictures(out: Path) -> None:
     """The views that the removal never saw, before and after."""
     say("drawing before and after")
-    scenes = [read_ply(p).gaussians for p in (SCENE / "scene.ply", OUT / "out.ply")]
+    scenes = [read_ply(p).gaussians for p in (SCENE / "scene.ply", out / "out.ply")]
     rows = []
     for camera in (c for c in read_cameras(SCENE / "transforms.json") if c.split == "test"):
         pair = [render_bytes(g, camera.scaled(2)) for g in scenes]
         rows.append(cv2.resize(np.hstack(pair), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA))
         name = Path(camera.id).stem
-        write_png(OUT / f"before_{name}.png", pair[0])
-        write_png(OUT / f"after_{name}.png", pair[1])
-    write_png(OUT / "before_after.png", np.vstack(rows[:2]))
+        write_png(out / f"before_{name}.png", pair[0])
+        write_png(out / f"after_{name}.png", pair[1])
+    write_png(out / "before_after.png", np.vstack(rows[:2]))
 
 
 def say(text: str) -> None:
