@@ -20,7 +20,7 @@ from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussian
 
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
-GROUP, MATERIAL = "3D-GIMP splats", "3D-GIMP splat"
+GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
 EXTENT = 3.0  # standard deviations drawn
 MANY = 200_000  # from here on splats are shown as points unless the user asks otherwise
 UP_AXES = {
@@ -60,7 +60,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     obj.matrix_world = matrix
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
-    modifier[_socket("As Points")] = len(gaussians) > MANY
+    modifier[socket("As Points")] = len(gaussians) > MANY
     return obj
 
 
@@ -175,18 +175,18 @@ def _attribute(mesh: bpy.types.Mesh, name: str, kind: str, key: str, array: np.n
 
 
 def node_group() -> bpy.types.NodeTree:
-    """Geometry nodes that put an ellipsoid, or a point, on every splat; one group for all objects."""
+    """Geometry nodes that put an ellipsoid, or in the viewport a point, on every splat; one group for all objects."""
     if GROUP in bpy.data.node_groups:
         return bpy.data.node_groups[GROUP]
     tree = bpy.data.node_groups.new(GROUP, "GeometryNodeTree")
     tree.is_modifier = True
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    points = tree.interface.new_socket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
-    points.description = "Show coloured points instead of ellipsoids: fast for millions of splats"
-    fraction = tree.interface.new_socket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
+    tree.interface.newsocket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    points = tree.interface.newsocket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
+    points.description = "Show points instead of ellipsoids in the viewport: fast for millions; renders are the same"
+    fraction = tree.interface.newsocket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
     fraction.default_value, fraction.min_value, fraction.max_value = 1.0, 0.0, 1.0
     fraction.description = "Share of the splats to show"
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    tree.interface.newsocket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     node, link = tree.nodes.new, tree.links.new
     source, target = node("NodeGroupInput"), node("NodeGroupOutput")
     lottery = node("FunctionNodeRandomValue")
@@ -220,19 +220,21 @@ def node_group() -> bpy.types.NodeTree:
     link(chosen.outputs["Result"], dots.inputs["Selection"])
     link(length.outputs["Value"], dots.inputs["Radius"])
     coloured = node("GeometryNodeSetMaterial")
-    coloured.inputs["Material"].default_value = splat_material()
+    coloured.inputs["Material"].default_value = point_material()
     link(dots.outputs["Points"], coloured.inputs["Geometry"])
 
-    choice = node("GeometryNodeSwitch")
-    choice.input_type = "GEOMETRY"
-    link(source.outputs["As Points"], choice.inputs["Switch"])
+    choice, both = node("GeometryNodeSwitch"), node("FunctionNodeBooleanMath")
+    choice.input_type, both.operation = "GEOMETRY", "AND"
+    link(source.outputs["As Points"], both.inputs[0])
+    link(node("GeometryNodeIsViewport").outputs[0], both.inputs[1])
+    link(both.outputs[0], choice.inputs["Switch"])
     link(instances.outputs["Instances"], choice.inputs["False"])
     link(coloured.outputs["Geometry"], choice.inputs["True"])
     link(choice.outputs["Output"], target.inputs["Geometry"])
     return tree
 
 
-def _socket(name: str) -> str:
+def socket(name: str) -> str:
     return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
 
 
@@ -247,12 +249,9 @@ def splat_material() -> bpy.types.Material:
     """Emission of a splat's colour with falloff: opacity · exp(−d²/2), d the ray's distance to the centre."""
     if MATERIAL in bpy.data.materials:
         return bpy.data.materials[MATERIAL]
-    material = bpy.data.materials.new(MATERIAL)
-    if material.node_tree is None:  # Blender < 5.0
-        material.use_nodes = True
+    material = _blank_material(MATERIAL)
     material.surface_render_method = "BLENDED"
     tree = material.node_tree
-    tree.nodes.clear()
     node, link = tree.nodes.new, tree.links.new
 
     def math(operation: str, a: object, b: object = None) -> bpy.types.NodeSocket:
@@ -297,6 +296,27 @@ def splat_material() -> bpy.types.Material:
     link(clear.outputs[0], mix.inputs[1])
     link(emission.outputs[0], mix.inputs[2])
     link(mix.outputs[0], out.inputs["Surface"])
+    return material
+
+
+def point_material() -> bpy.types.Material:
+    """Opaque emission of a point's colour. A point is no instance, so it carries its colour itself."""
+    if POINT_MATERIAL in bpy.data.materials:
+        return bpy.data.materials[POINT_MATERIAL]
+    material = _blank_material(POINT_MATERIAL)
+    node, link = material.node_tree.nodes.new, material.node_tree.links.new
+    colour, emission, out = node("ShaderNodeAttribute"), node("ShaderNodeEmission"), node("ShaderNodeOutputMaterial")
+    colour.attribute_type, colour.attribute_name = "GEOMETRY", "color"
+    link(colour.outputs["Color"], emission.inputs["Color"])
+    link(emission.outputs[0], out.inputs["Surface"])
+    return material
+
+
+def _blank_material(name: str) -> bpy.types.Material:
+    material = bpy.data.materials.new(name)
+    if material.node_tree is None:  # Blender < 5.0
+        material.use_nodes = True
+    material.node_tree.nodes.clear()
     return material
 
 

@@ -186,7 +186,7 @@ def test_node_group_and_material_are_shared(few_gaussians: Gaussians, import_sce
     first, second = import_scene(few_gaussians), import_scene(few_gaussians)
     assert first.modifiers[0].node_group == second.modifiers[0].node_group
     assert first.data.materials[0] == second.data.materials[0]
-    assert len(bpy.data.node_groups) == 1 and len(bpy.data.materials) == 1
+    assert len(bpy.data.node_groups) == 1 and len(bpy.data.materials) == 2  # ellipsoids, points
 
 
 def test_every_usable_splat_is_one_instance(few_gaussians: Gaussians, import_scene) -> None:
@@ -204,6 +204,24 @@ def test_a_large_scene_is_shown_as_points(few_gaussians: Gaussians, import_scene
     assert not any(
         i.is_instance and i.object.type == "MESH" for i in bpy.context.evaluated_depsgraph_get().object_instances
     )
+
+
+def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, import_scene, tmp_path: Path) -> None:
+    splat = import_scene(few_gaussians)
+    blender_scene, obj = bpy.context.scene, bpy.data.objects.new("c", bpy.data.cameras.new("c"))
+    blender_scene.collection.objects.link(obj)
+    obj.location, blender_scene.camera = (0, 0, 8), obj
+    render = blender_scene.render
+    render.engine, render.resolution_x, render.resolution_y = "CYCLES", 32, 24
+    blender_scene.cycles.samples, blender_scene.cycles.use_denoising = 4, False
+    pictures = []
+    for as_points in (False, True):
+        splat.modifiers[0][socket("As Points")] = as_points
+        splat.update_tag()
+        render.filepath = str(tmp_path / f"{as_points}.png")
+        bpy.ops.render.render(write_still=True)
+        pictures.append(read_image(render.filepath))
+    assert pictures[0].max() > 20 and (pictures[0] == pictures[1]).all()
 
 
 @pytest.mark.slow

@@ -29,7 +29,8 @@ def test_all_cameras_frame_the_region_from_above_and_outside(up: tuple[float, fl
 
 
 @pytest.mark.parametrize(
-    "change", [{"up": (0, 0, 0)}, {"count": 0}, {"fov_degrees": 0.5}, {"fov_degrees": 180}, {"width": 0}, {"up": (np.nan, 0, 0)}]
+    "change",
+    [{"up": (0, 0, 0)}, {"count": 0}, {"fov_degrees": 0.5}, {"fov_degrees": 180}, {"width": 0}, {"up": (np.nan, 0, 0)}],
 )
 def test_senseless_orbits_are_refused(change: dict) -> None:
     with pytest.raises(BadInput, match="orbit"):

@@ -42,7 +42,10 @@ def test_the_demo_removes_the_vase(tmp_path: Path) -> None:
     pytest.importorskip("bpy", reason="the bpy module is not installed (make setup installs it)")
     out = tmp_path / "demo"
     done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "demo.py"), "--out", str(out)], capture_output=True, text=True, timeout=600
+        [sys.executable, str(ROOT / "scripts" / "demo.py"), "--out", str(out)],
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert {"demo.blend", "before_after.png", "out.ply", "report"} <= {p.name for p in out.iterdir()}

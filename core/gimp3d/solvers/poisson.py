@@ -127,7 +127,7 @@ def _system(
     channels = values.shape[2] if values.ndim == 3 else 1
 
     def padded(array: np.ndarray | None, dtype: type, *more: int) -> np.ndarray:
-        out = np.zeros((h + 3 - h % 2, w + 3 - w % 2, *more), dtype)
+        out: np.ndarray = np.zeros((h + 3 - h % 2, w + 3 - w % 2, *more), dtype)
         if array is not None:
             out[1 : h + 1, 1 : w + 1] = array.reshape(h, w, *more)
         return out

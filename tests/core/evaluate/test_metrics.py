@@ -33,7 +33,11 @@ def test_ssim_against_the_definition() -> None:
         for c in range(3):
             a, b = (p[y - 5 : y + 6, x - 5 : x + 6, c].astype(float) / 255 for p in (PICTURE, other))
             ma, mb = (window * a).sum(), (window * b).sum()
-            va, vb, co = (window * a * a).sum() - ma**2, (window * b * b).sum() - mb**2, (window * a * b).sum() - ma * mb
+            va, vb, co = (
+                (window * a * a).sum() - ma**2,
+                (window * b * b).sum() - mb**2,
+                (window * a * b).sum() - ma * mb,
+            )
             expected.append((2 * ma * mb + 1e-4) * (2 * co + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
         assert found[y, x] == pytest.approx(np.mean(expected), abs=1e-9)
 

@@ -118,7 +118,10 @@ def test_photos_are_undistorted_to_the_same_pinhole(tmp_path: Path) -> None:
         r, c = int(v), int(u)
         patch = image[max(r - 6, 0) : r + 7, max(c - 6, 0) : c + 7, 0].astype(float)
         dy, dx = np.mgrid[: patch.shape[0], : patch.shape[1]]
-        at = ((dx * patch).sum() / patch.sum() + max(c - 6, 0) + 0.5, (dy * patch).sum() / patch.sum() + max(r - 6, 0) + 0.5)
+        at = (
+            (dx * patch).sum() / patch.sum() + max(c - 6, 0) + 0.5,
+            (dy * patch).sum() / patch.sum() + max(r - 6, 0) + 0.5,
+        )
         assert at == pytest.approx((u, v), abs=0.1)
 
 
@@ -135,7 +138,10 @@ def test_pictures_of_every_kind_become_rgb(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     cases = {
         "grey": (rng.integers(0, 255, (5, 6), dtype=np.uint8), lambda p: p[..., None].repeat(3, -1)),
-        "alpha": (np.dstack([np.full((5, 6, 3), 200, np.uint8), np.full((5, 6), 51, np.uint8)]), lambda p: p[..., :3] // 5),
+        "alpha": (
+            np.dstack([np.full((5, 6, 3), 200, np.uint8), np.full((5, 6), 51, np.uint8)]),
+            lambda p: p[..., :3] // 5,
+        ),
         "deep": (np.full((5, 6, 3), 65535, np.uint16), lambda p: np.full((5, 6, 3), 255, np.uint8)),
     }
     for name, (picture, expected) in cases.items():
@@ -161,7 +167,10 @@ REFUSALS = {
     "same ID twice": ({"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": POSE}] * 2}, "ID a"),
     "no name": ({"fl_x": 5, "frames": [{"transform_matrix": POSE}]}, "no name"),
     "absolute name": ({"fl_x": 5, "frames": [{"file_path": "/etc/x", "transform_matrix": POSE}]}, "leads out"),
-    "fisheye": ({"fl_x": 5, "camera_model": "OPENCV_FISHEYE", "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "fisheye"),
+    "fisheye": (
+        {"fl_x": 5, "camera_model": "OPENCV_FISHEYE", "frames": [{"file_path": "a", "transform_matrix": POSE}]},
+        "fisheye",
+    ),
     "k4": ({"fl_x": 5, "k4": 0.1, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "k4"),
     "bad split": ({"fl_x": 5, "split": "x", "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "split"),
 }

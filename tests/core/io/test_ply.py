@@ -28,7 +28,9 @@ FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-def make(path: Path, names: Sequence[str], form: str = "binary_little_endian", rows: int = 20, kind: str = "float") -> np.ndarray:
+def make(
+    path: Path, names: Sequence[str], form: str = "binary_little_endian", rows: int = 20, kind: str = "float"
+) -> np.ndarray:
     """Write a PLY with plain NumPy; returns its values."""
     order = FORMATS[form]
     dtype = np.dtype([(n, order + ("f8" if kind == "double" else "f4")) for n in names])
@@ -160,7 +162,11 @@ SPOILED = {
     "rgb only": (b"f_dc_", b"red f_dx_", "makes no sense|no property f_dc_0"),
     "missing opacity": (b"property float opacity\n", b"property float other\n", "no property opacity"),
     "missing rotation": (b"property float rot_3\n", b"property float other\n", "no property rot_3"),
-    "four scales": (b"property float opacity", b"property float scale_3\nproperty float opacity", "found 4 scales|truncated"),
+    "four scales": (
+        b"property float opacity",
+        b"property float scale_3\nproperty float opacity",
+        "found 4 scales|truncated",
+    ),
     "odd SH count": (b"property float opacity", b"property float f_rest_0\nproperty float opacity", "f_rest|truncated"),
     "twice": (b"property float y\n", b"property float x\n", "occurs twice"),
     "list": (b"property float opacity", b"property list uchar int opacity", "list property"),

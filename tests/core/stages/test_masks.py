@@ -87,7 +87,9 @@ def test_what_only_the_removal_reveals_goes_too() -> None:
 
 
 def test_cameras_inside_the_region_are_left_out() -> None:
-    inside = Camera("inside", 60, 40, 50, 50, 30, 20, look_at(np.array([0.1, 0, 0.2]), np.ones(3), np.array([0, 0, 1.0])))
+    inside = Camera(
+        "inside", 60, 40, 50, 50, 30, 20, look_at(np.array([0.1, 0, 0.2]), np.ones(3), np.array([0, 0, 1.0]))
+    )
     masks = find_masks(scene(), REGION, [*cameras(), inside])
     assert masks.left_out == ("inside",) and len(masks.views) == 9
 

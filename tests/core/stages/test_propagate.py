@@ -42,13 +42,15 @@ def view(reference: Reference, index: int, gain: float = 1.0) -> ViewToPaint:
     image, depth = whole(camera)
     image = np.clip(image * gain, 0, 255).astype(np.uint8)
     points = camera.unproject(camera.pixel_centres(), depth.astype(float))
-    uv, z = reference.camera.project(points)
+    uv, _ = reference.camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (uv[..., 0] > 40) & (uv[..., 0] < 65) & (uv[..., 1] > 40) & (uv[..., 1] < 60) & (depth > 0)
     photo = image.copy()
     photo[inside] = [200, 0, 0]
     before = np.where(inside, 0.5 * depth, depth).astype(np.float32)
-    return ViewToPaint(camera, photo, np.where(inside[..., None], 0, photo).astype(np.uint8), inside, inside, before, depth)
+    return ViewToPaint(
+        camera, photo, np.where(inside[..., None], 0, photo).astype(np.uint8), inside, inside, before, depth
+    )
 
 
 @pytest.mark.parametrize("index", [0, 2, 4])

@@ -70,7 +70,9 @@ def test_evidence_is_the_true_colour_and_never_the_objects() -> None:
     view = masks.views[0]
     true = render(truth(), view.camera)
     sources = [(v.camera, render_bytes(scene(), v.camera), v.depth_before) for v in masks.views]
-    evidence = gather_evidence(view.camera, true.median_depth, view.silhouette, sources, EvidenceSettings(tolerance=0.02))
+    evidence = gather_evidence(
+        view.camera, true.median_depth, view.silhouette, sources, EvidenceSettings(tolerance=0.02)
+    )
     assert evidence.seen.any() and not (evidence.seen & ~view.silhouette).any()
     difference = np.abs(evidence.image[evidence.seen].astype(float) - 255 * np.clip(true.rgb[evidence.seen], 0, 1))
     assert np.median(difference) < 4 and np.percentile(difference, 95) < 25
