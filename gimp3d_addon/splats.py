@@ -60,7 +60,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     obj.matrix_world = matrix
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
-    modifier[socket("As Points")] = len(gaussians) > MANY
+    modifier[_socket("As Points")] = len(gaussians) > MANY
     return obj
 
 
@@ -180,13 +180,13 @@ def node_group() -> bpy.types.NodeTree:
         return bpy.data.node_groups[GROUP]
     tree = bpy.data.node_groups.new(GROUP, "GeometryNodeTree")
     tree.is_modifier = True
-    tree.interface.newsocket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    points = tree.interface.newsocket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    points = tree.interface.new_socket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
     points.description = "Show points instead of ellipsoids in the viewport: fast for millions; renders are the same"
-    fraction = tree.interface.newsocket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
+    fraction = tree.interface.new_socket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
     fraction.default_value, fraction.min_value, fraction.max_value = 1.0, 0.0, 1.0
     fraction.description = "Share of the splats to show"
-    tree.interface.newsocket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     node, link = tree.nodes.new, tree.links.new
     source, target = node("NodeGroupInput"), node("NodeGroupOutput")
     lottery = node("FunctionNodeRandomValue")
@@ -234,7 +234,7 @@ def node_group() -> bpy.types.NodeTree:
     return tree
 
 
-def socket(name: str) -> str:
+def _socket(name: str) -> str:
     return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
 
 

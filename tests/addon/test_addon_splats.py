@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import bmesh
+import bpy
 import numpy as np
 import pytest
 
 from gimp3d.gaussians import SH_C0, Gaussians
+from gimp3d.io.images import read_image
 from gimp3d.io.ply import read_ply, write_gaussians
-
-bpy = pytest.importorskip("bpy", reason="Blender's Python module bpy is not installed")
-import bmesh
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]
@@ -214,9 +214,11 @@ def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, impor
     render = blender_scene.render
     render.engine, render.resolution_x, render.resolution_y = "CYCLES", 32, 24
     blender_scene.cycles.samples, blender_scene.cycles.use_denoising = 4, False
+    modifier = splat.modifiers[0]
+    switch = next(s.identifier for s in modifier.node_group.interface.items_tree if s.name == "As Points")
     pictures = []
     for as_points in (False, True):
-        splat.modifiers[0][socket("As Points")] = as_points
+        modifier[switch] = as_points
         splat.update_tag()
         render.filepath = str(tmp_path / f"{as_points}.png")
         bpy.ops.render.render(write_still=True)
