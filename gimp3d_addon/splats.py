@@ -1,7 +1,7 @@
 """A Gaussian scene as a Blender object: mesh vertices, named attributes, instances on points, a falloff material.
 
 Every PLY property is kept losslessly in its own attribute, so that an export gives the file's bytes back; the
-attributes `scale`, `rotation`, `opacity` and `color` hold activated values for drawing.
+attributes `scale`, `rotation`, `opacity` and `splat_color` hold activated values for drawing.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussians_of, values
 
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
+COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
 GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
 EXTENT = 3.0  # standard deviations drawn
@@ -162,7 +163,7 @@ def _store_display(mesh: bpy.types.Mesh, gaussians: Gaussians, usable: np.ndarra
         ("scale", "FLOAT_VECTOR", "vector", scales),
         ("rotation", "QUATERNION", "value", quats),
         ("opacity", "FLOAT", "value", gaussians.opacity),
-        ("color", "FLOAT_COLOR", "color", shown),
+        (COLOUR, "FLOAT_COLOR", "color", shown),
     ):
         clean = np.array(array, np.float32)
         clean[hide] = 0
@@ -272,7 +273,7 @@ def splat_material() -> bpy.types.Material:
         return product.outputs["Value"]
 
     colour, opacity = (node("ShaderNodeAttribute") for _ in range(2))
-    for attribute, name in ((colour, "color"), (opacity, "opacity")):
+    for attribute, name in ((colour, COLOUR), (opacity, "opacity")):
         attribute.attribute_type, attribute.attribute_name = "INSTANCER", name
     geometry, place = node("ShaderNodeNewGeometry"), node("ShaderNodeTexCoord")
     to_object, ray = node("ShaderNodeVectorTransform"), node("ShaderNodeVectorMath")
@@ -306,7 +307,7 @@ def point_material() -> bpy.types.Material:
     material = _blank_material(POINT_MATERIAL)
     node, link = material.node_tree.nodes.new, material.node_tree.links.new
     colour, emission, out = node("ShaderNodeAttribute"), node("ShaderNodeEmission"), node("ShaderNodeOutputMaterial")
-    colour.attribute_type, colour.attribute_name = "GEOMETRY", "color"
+    colour.attribute_type, colour.attribute_name = "GEOMETRY", COLOUR
     link(colour.outputs["Color"], emission.inputs["Color"])
     link(emission.outputs[0], out.inputs["Surface"])
     return material

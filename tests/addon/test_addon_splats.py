@@ -162,7 +162,7 @@ def test_display_attributes_hold_activated_values(few_gaussians: Gaussians, impo
     np.testing.assert_allclose(column("opacity", "value", 1)[:, 0], few_gaussians.opacity, rtol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(column("rotation", "value", 4), axis=1), 1, rtol=1e-6)
     encoded = np.clip(0.5 + SH_C0 * few_gaussians.sh[:, 0], 0, 1)
-    linear = column("color", "color", 4)[:, :3]
+    linear = column("splat_color", "color", 4)[:, :3]
     back = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(back, encoded, atol=1e-4)
 
