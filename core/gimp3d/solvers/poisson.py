@@ -110,7 +110,7 @@ class _System:
     """
 
     hole: np.ndarray  # [h, w] float32, 1 on unknowns
-    diagonal: np.ndarray  # [h, w] float32, neighbours in hole ∪ known, plus the weight
+    diagonal: np.ndarray  # [h, w] float64, neighbours in hole ∪ known, plus the weight
     right: np.ndarray  # [C, h, w] float64
     shape: tuple[int, ...]  # (M,) or (M, C) of the answer
 
@@ -133,7 +133,7 @@ def _system(
         return out
 
     inside = padded(hole, np.bool_)
-    diagonal = np.zeros(inside.shape, np.float32)
+    diagonal = np.zeros(inside.shape)
     right = np.zeros((channels, *inside.shape))
     _assemble(
         inside,
@@ -174,7 +174,7 @@ def _solve_directly(system: _System, rows: np.ndarray, cols: np.ndarray) -> np.n
         pairs.append(np.stack([np.flatnonzero(neighbour >= 0), neighbour[neighbour >= 0]]))
     links = np.concatenate(pairs, axis=1)
     adjacency = scipy.sparse.coo_matrix((np.ones(links.shape[1]), links), (len(rows), len(rows)))
-    matrix = scipy.sparse.diags(system.diagonal[rows, cols].astype(np.float64)) - adjacency
+    matrix = scipy.sparse.diags(system.diagonal[rows, cols]) - adjacency
     factor = scipy.sparse.linalg.splu(
         matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0}
     )
@@ -219,7 +219,8 @@ class _Multigrid:
     """
 
     def __init__(self, system: _System, coarsest: int) -> None:
-        mask, stencil = system.hole, _five_point(system.hole, system.diagonal)
+        mask, self.diagonal = system.hole, system.diagonal.astype(np.float32)
+        stencil = _five_point(mask, self.diagonal)
         self.masks, self.stencils = [mask], [stencil]
         while mask.sum() > coarsest:
             sides = [(n - 1) // 2 for n in mask.shape]
@@ -231,7 +232,6 @@ class _Multigrid:
             self.stencils.append(stencil)
         self.inverses = [np.where(m > 0, 1 / np.where(m > 0, s[4], 1), 0) for m, s in zip(self.masks, self.stencils)]
         self.stencils[0] = stencil[:, :0, :0]  # the finest is applied from its diagonal alone
-        self.diagonal = system.diagonal
         self.solutions, self.rights, self.residuals = ([np.zeros_like(m) for m in self.masks] for _ in range(3))
         self.nodes = np.nonzero(mask)
         self.inverse = _pseudo_inverse(stencil, mask)
