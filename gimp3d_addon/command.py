@@ -1,18 +1,21 @@
-"""`blender --command gimp3d …`: the command line of the library, inside Blender (CONTRACT: gimp3d)."""
+"""`blender --command gimp3d …`: the command line of the library, from Blender (CONTRACT: gimp3d)."""
 
 from __future__ import annotations
 
+import subprocess
 from typing import Any
 
 import bpy
+
+from .operators.base import python_of
+from .worker import child_command
 
 _handles: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
-    from gimp3d.cli import main
-
-    return main(arguments)
+    """In a child, as Remove does: Blender's own Python may lack what the chosen one has."""
+    return subprocess.run(child_command(arguments, python_of(bpy.context)), check=False).returncode
 
 
 def register() -> None:

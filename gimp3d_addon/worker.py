@@ -19,20 +19,39 @@ from typing import Any
 import gimp3d
 from gimp3d.errors import BadInput, Gimp3dError
 
-# The core's folder comes last on the path: a chosen Python uses its own NumPy, numba and OpenCV.
-BOOT = "import sys; sys.path.append(sys.argv.pop(1)); from gimp3d.cli import entry_point; entry_point()"
+# The core's folder comes last on the path: a chosen Python uses its own NumPy, numba and OpenCV. The folder that
+# Blender was started in comes off it, as a user's numpy.py there must not be imported.
+BOOT = """
+import importlib.util, sys
+sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
+missing = [m for m in ("numpy", "scipy", "numba", "cv2") if importlib.util.find_spec(m) is None]
+if missing:
+    print(
+        f"gimp3d: error: {sys.executable} has no {', '.join(missing)}; in the preferences of 3D-GIMP, choose a Python "
+        "that has numba, scipy and opencv-contrib-python-headless",
+        file=sys.stderr,
+    )
+    sys.exit(2)
+from gimp3d.cli import entry_point
+entry_point()
+"""
+
+
+def child_command(arguments: Sequence[str], python: str = "") -> list[str]:
+    """The command line that runs `gimp3d arguments` in a chosen Python, or in Blender's own."""
+    folder = Path(gimp3d.__file__).resolve().parents[1]
+    return [python or sys.executable, "-X", "utf8", "-c", BOOT, str(folder), *arguments]
 
 
 class Worker:
     """One `gimp3d` command in a child process; `poll` takes its progress, `cancel` ends it at once."""
 
     def __init__(self, arguments: Sequence[str], python: str = "") -> None:
-        interpreter = python or sys.executable
-        folder = str(Path(gimp3d.__file__).resolve().parents[1])
+        command = child_command(arguments, python)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115, lives as long as the child
         try:
             self._process = subprocess.Popen(
-                [interpreter, "-c", BOOT, folder, *arguments],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
@@ -41,7 +60,7 @@ class Worker:
             )
         except OSError as error:
             raise BadInput(
-                f"cannot start {interpreter} ({error.strerror}); choose a Python in the preferences"
+                f"cannot start {command[0]} ({error.strerror}); choose a Python in the preferences"
             ) from None
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +17,11 @@ from mathutils import Vector
 from scenes import REGION, cameras, scene
 
 from gimp3d.cli import main
+from gimp3d.errors import Gimp3dError
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.images import write_png
-from gimp3d_addon import bridge, jobs
+from gimp3d_addon import bridge, command, jobs
 from gimp3d_addon.operators.base import current_boxes, current_splat
 from gimp3d_addon.operators.remove import SOURCE
 from gimp3d_addon.worker import Worker
@@ -235,3 +239,22 @@ def test_the_split_goes_through_blender(splat: bpy.types.Object, tmp_path: Path)
 def test_a_box_can_be_added_to_an_empty_scene(few_gaussians: Gaussians, import_scene) -> None:
     import_scene(few_gaussians.take(np.arange(0)))
     assert bpy.ops.gimp3d.add_roi() == {"FINISHED"} and bpy.context.object.scale.x == 1
+
+
+def test_a_python_without_the_libraries_is_named(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "bare")], check=True)
+    python = tmp_path / "bare" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    with pytest.raises(Gimp3dError, match=r"bare.* has no numpy, scipy, numba, cv2; .*preferences"):
+        Worker(["info", "scene.ply"], str(python)).wait()
+
+
+def test_a_module_beside_the_file_is_not_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "numpy.py").write_text("raise SystemExit('a user's own file')")
+    monkeypatch.chdir(tmp_path)
+    assert Worker(["--version"]).wait() == {}
+
+
+def test_blenders_command_gives_the_exit_codes(capfd: pytest.CaptureFixture[str]) -> None:
+    assert command._run(["--version"]) == 0
+    assert command._run(["info", "nowhere.ply"]) == 2
+    assert capfd.readouterr().err.startswith("gimp3d: error: ")
