@@ -12,8 +12,6 @@ import scipy.ndimage
 from ..errors import IllPosed
 from ..solvers.poisson import solve_poisson
 
-ON = 1
-SIG = 6
 AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
 
 
@@ -35,9 +33,10 @@ class DepthSettings:
     gradient_step: int = 6  # differences over this distance suffer least from a prior's noise (research, K2)
     minimum_ring: int = 10  # ring pixels below which nothing can be measured
     minimum_correlation: float = 0.2  # between the prior's and the scene's gradients
+    smoothing: float = 12.0  # σ of the average of what the ring deviates from a plane
     layer_jump: float = 0.06  # step on the rim that parts two layers
     layer_band: int = 4  # width of the ring on which layers are told apart
-    occluder_share: float = 0.4  # of the rim; a nearer layer that holds more is what the object stood on
+    occluder_share: float = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
     low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
     high: float = 4.0
 
@@ -81,24 +80,27 @@ def complete_disparity(
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
         return _completion(scene, 0.0, 0, 1.0, "nothing to fill")
-    rim = background_rim(scene, trusted, hole, settings)
-    touches = bool((rim & scipy.ndimage.binary_dilation(hole)).any())
-    fit, planes = PriorFit(0.0, 0.0, 0.7, "harmonic"), None
+    anchored = bool((trusted & scipy.ndimage.binary_dilation(hole)).any())
+    window = _window(hole, settings.plane_ring + 1) if anchored else np.s_[:, :]
+    background, inside = scene[window], hole[window]
+    rim = background_rim(background, trusted[window], inside, settings)
+    fit, guidance = PriorFit(0.0, 0.0, 0.7, "harmonic"), None
+    surfaces: tuple[Surface, ...] = ()
     if prior is not None:
-        fit = fit_prior(scene, rim, hole, prior, settings, near_the_hole=touches)
-    elif settings.surface != "harmonic":
-        planes = planar_surfaces(scene, rim, hole, settings)
-        if planes.share >= settings.plane_share:
-            fit = PriorFit(0.0, 0.0, planes.share, planes.reason)
+        fit = fit_prior(background, rim, inside, prior[window], settings, on_ring=anchored)
+        guidance = fit.scale * prior[window] + fit.shift if fit.scale else None
+    elif anchored and settings.surface != "harmonic":
+        planar = planar_surfaces(background, rim, inside, settings)
+        if planar.share >= settings.plane_share:
+            fit, surfaces = PriorFit(0.0, 0.0, planar.share, planar.reason), planar.surfaces
         elif settings.surface == "planar":
-            raise IllPosed(f"depth: {planes.reason}, too few for planes; use --depth-prior auto")
-        else:
-            planes = None
-    if not touches and fit.scale == 0:
+            raise IllPosed(f"depth: only {planar.share:.0%} of the surroundings lie on planes; use --depth-prior auto")
+    if not anchored and guidance is None:
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
-    guidance = fit.scale * prior + fit.shift if prior is not None and fit.scale else None
-    filled = _fill(scene, rim, hole, planes.surfaces if planes else (), guidance, settings)
-    return _settled(filled, scene, rim, hole, fit, settings)
+    filled = _fill(background, rim, inside, surfaces, guidance, settings)
+    filled, clamped, confidence, reason = _settle(filled, background, rim, inside, fit, settings)
+    scene[window] = np.where(inside, filled, background)
+    return _completion(scene, fit.scale, clamped, confidence, reason)
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def fit_prior(
     hole: np.ndarray,  # [H, W] bool
     prior: np.ndarray,  # [H, W] relative disparity
     settings: DepthSettings = DepthSettings(),
-    near_the_hole: bool = True,  # measure on the ring; else on everything known
+    on_ring: bool = True,  # else on everything known
 ) -> PriorFit:
     """Measure s_f by least squares between gradients on the ring (METHOD section 3).
 
@@ -125,7 +127,7 @@ def fit_prior(
     says nothing: too few pixels, no variance, no or negative agreement.
     """
     ring = known & (disparity > 0) & np.isfinite(prior)
-    if near_the_hole:
+    if on_ring:
         ring &= _distance(hole) <= settings.ring
     k, pairs = settings.gradient_step, []
     for near, far in ((np.s_[:, :-k], np.s_[:, k:]), (np.s_[:-k], np.s_[k:])):
@@ -159,8 +161,9 @@ def background_rim(
 ) -> np.ndarray:
     """[H, W] bool: the known pixels that may bound the hole, that is, not those of occluders in front of it.
 
-    Layers are the parts of the band round the hole between jumps. One that ends at a jump, lies in front of the
-    largest and holds little of the rim is an occluder: the farther layer goes on behind it (METHOD section 3).
+    Layers are the parts of the band round the hole between jumps. Taken from the farthest on, those that together make
+    up most of the rim are what the hole lies in; nearer ones that end at a jump are occluders, behind which the others
+    go on (METHOD section 3).
     Surfaces that meet, as a floor and a wall, have no jump between them, however steep.
     """
     distance = _distance(hole)
@@ -173,8 +176,11 @@ def background_rim(
     sizes = scipy.ndimage.sum_labels(distance < 2, layers, numbers)
     heights = scipy.ndimage.median(disparity, layers, numbers)
     beside_jump = np.isin(numbers, layers[scipy.ndimage.binary_dilation(jumps, AROUND)])
-    nearer = (1 + settings.layer_jump) * heights[np.argmax(sizes)]
-    occluder = beside_jump & (heights > nearer) & (sizes < settings.occluder_share * sizes.sum())
+    far_first = np.argsort(heights)
+    reached = np.cumsum(sizes[far_first])
+    background = heights[far_first][np.searchsorted(reached, (1 - settings.occluder_share) * reached[-1])]
+    nearer = (1 + settings.layer_jump) * background
+    occluder = beside_jump & (heights > nearer)
     dropped = np.isin(layers, numbers[occluder]) | (jumps & (disparity > nearer) & occluder.any())
     return known & ~dropped
 
@@ -303,83 +309,99 @@ def _fill(
     guidance: np.ndarray | None,
     settings: DepthSettings,
 ) -> np.ndarray:
-    """Disparity [H, W] float64 in the hole, NaN where nothing says anything.
+    """Disparity [H, W] float64 of the hole, NaN where nothing says anything.
 
-    Each surface gets the part of the hole that is nearest to its rim in the harmonic sense.
+    Each surface, and what of the rim is on none, gets the part of the hole where the harmonic extension of its share
+    of the rim is largest.
     """
     rim = rim & scipy.ndimage.binary_dilation(hole)
-    if not surfaces and (rim & (disparity == 0)).any():
-        surfaces = (Surface(np.zeros(hole.shape), rim & (disparity == 0)),)
-    rest = len(surfaces)
-    layer = np.full(hole.shape, -1)
-    layer[rim] = rest
-    for k, surface in reversed(list(enumerate(surfaces))):
-        most = settings.layer_jump * np.maximum(disparity, surface.disparity)
-        layer[rim & (np.abs(disparity - surface.disparity) <= most)] = k
-    if rest and (layer == rest).sum() < settings.least_layer * rim.sum():
-        layer[layer == rest] = -1
+    sky = rim & (disparity == 0)
+    if not surfaces and sky.any():
+        surfaces = (Surface(np.zeros(hole.shape), sky),)
+    loose = len(surfaces)
+    layer = _layers(disparity, rim, surfaces, settings)
     present = np.unique(layer[layer >= 0])
-    part = np.full(hole.shape, present[0] if len(present) else rest)
+    part = np.full(hole.shape, present[0] if len(present) else loose)
     if len(present) > 1:
         votes = solve_poisson(hole, layer >= 0, (layer[..., None] == present).astype(np.float64)).values
         part = present[np.nan_to_num(votes).argmax(-1)]
-    loose = hole & (part == rest)
-    filled = np.where(loose, solve_poisson(loose, layer == rest, disparity, guidance).values, np.nan)
-    if rest:
-        planar = np.choose(np.clip(part, 0, rest - 1), [s.disparity for s in surfaces])
-        base = np.choose(np.clip(layer, 0, rest - 1), [s.disparity for s in surfaces])
-        on_planes = (layer >= 0) & (layer < rest)
-        dist = _distance(hole)
-        ring = (dist > 0) & (dist <= settings.plane_ring)
-        num = np.zeros(hole.shape)
-        den = np.zeros(hole.shape)
-        for k, sf in enumerate(surfaces):
-            on = sf.on & (np.abs(disparity - sf.disparity) <= ON * settings.plane_inlier * disparity)
-            n_ = cv2.GaussianBlur(np.where(on, disparity - sf.disparity, 0), (0, 0), SIG)
-            d_ = cv2.GaussianBlur(on.astype(float), (0, 0), SIG)
-            num = np.where(layer == k, n_, num)
-            den = np.where(layer == k, d_, den)
-        ok = on_planes & (den > 0.02)
-        deviation = solve_poisson(hole, ok, num / np.maximum(den, 1e-9)).values
-        filled = np.where(hole & ~loose, planar + np.nan_to_num(deviation), filled)
+    rest = hole & (part == loose)
+    filled = np.where(rest, solve_poisson(rest, layer == loose, disparity, guidance).values, np.nan)
+    for k, surface in enumerate(surfaces):
+        own = hole & (part == k)
+        filled[own] = (surface.disparity + _deviation(disparity, surface, own, layer == k, settings))[own]
     return filled
 
 
-def _settled(
+def _layers(
+    disparity: np.ndarray, rim: np.ndarray, surfaces: tuple[Surface, ...], settings: DepthSettings
+) -> np.ndarray:
+    """[H, W] int: the surface on which each rim pixel lies, len(surfaces) for none, −1 off the rim."""
+    layer = np.where(rim, len(surfaces), -1)
+    for k, surface in reversed(list(enumerate(surfaces))):
+        step = settings.layer_jump * np.maximum(disparity, surface.disparity)
+        layer[rim & (np.abs(disparity - surface.disparity) <= step)] = k
+    if surfaces and (layer == len(surfaces)).sum() < settings.least_layer * rim.sum():
+        layer[layer == len(surfaces)] = -1
+    return layer
+
+
+def _deviation(
+    disparity: np.ndarray, surface: Surface, own: np.ndarray, rim: np.ndarray, settings: DepthSettings
+) -> np.ndarray:
+    """[H, W]: what the ring deviates from the surface, averaged along it and extended harmonically into the hole.
+
+    The pixels that touch the hole are biased by the object's haze: averaging over the whole ring is 4 to 6 times as
+    accurate as meeting them exactly, measured on scenes with known truth.
+    """
+    known = surface.on.astype(np.float64)
+    weight = cv2.GaussianBlur(known, (0, 0), settings.smoothing)
+    total = cv2.GaussianBlur(known * (disparity - surface.disparity), (0, 0), settings.smoothing)
+    average = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.01)
+    return np.nan_to_num(solve_poisson(own, rim & (weight > 0.01), average).values)
+
+
+def _settle(
     filled: np.ndarray,
-    scene: np.ndarray,
+    disparity: np.ndarray,
     rim: np.ndarray,
     hole: np.ndarray,
     fit: PriorFit,
     settings: DepthSettings,
-) -> DepthCompletion:
-    """The result with every pixel decided and kept to the ring's range."""
+) -> tuple[np.ndarray, int, float, str]:
+    """Every pixel decided and kept to the ring's range: (disparity, pixels clamped, confidence, reason)."""
     confidence, reason = fit.confidence, fit.reason
-    ring = scene[rim & (_distance(hole) <= settings.layer_band)]
-    if not len(ring):
-        ring = scene[rim]
     undecided = hole & ~np.isfinite(filled)
     if undecided.any():
         nearest = scipy.ndimage.distance_transform_edt(~rim, return_distances=False, return_indices=True)
-        filled = np.where(undecided, scene[tuple(nearest)], filled)
+        filled = np.where(undecided, disparity[tuple(nearest)], filled)
         confidence, reason = min(confidence, 0.3), f"{reason}; a part of the hole has no rim: nearest depth used"
-    sky = bool((ring == 0).any())
-    ring = ring[ring > 0]
-    low, high = (settings.low * ring.min(), settings.high * ring.max()) if len(ring) else (0.0, 0.0)
-    if sky:  # what the ring shows to be that far is infinitely far
-        filled = np.where(filled < low, 0.0, np.minimum(filled, high))
-        clamped = 0
-    kept = filled if sky else np.clip(filled, low, high)
-    clamped = int((hole & (kept != filled)).sum())
+    ring = rim & (_distance(hole) <= settings.layer_band)
+    around = disparity[ring if ring.any() else rim]
+    finite = around[around > 0]
+    low, high = (settings.low * finite.min(), settings.high * finite.max()) if len(finite) else (0.0, 0.0)
+    if (around == 0).any():  # where the ring shows sky, so far means infinitely far
+        filled = np.where(filled < low, 0.0, filled)
+        low = 0.0
+    clamped = int((hole & ((filled < low) | (filled > high))).sum())
     if clamped > 0.05 * hole.sum():
-        confidence, reason = confidence * 0.5, f"{reason}; {clamped} pixels clamped to the ring's range"
-    return _completion(np.where(hole, kept, scene), fit.scale, clamped, confidence, reason)
+        confidence, reason = 0.5 * confidence, f"{reason}; {clamped} pixels clamped to the ring's range"
+    return np.clip(filled, low, high), clamped, confidence, reason
 
 
 def _completion(disparity: np.ndarray, scale: float, clamped: int, confidence: float, reason: str) -> DepthCompletion:
     disparity = disparity.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
     return DepthCompletion(disparity, depth, scale, clamped, confidence, reason)
+
+
+def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """The hole's bounding box and what is round it."""
+    rows, cols = np.flatnonzero(hole.any(1)), np.flatnonzero(hole.any(0))
+    return (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+        slice(max(cols[0] - margin, 0), cols[-1] + margin + 1),
+    )
 
 
 def _distance(hole: np.ndarray) -> np.ndarray:
