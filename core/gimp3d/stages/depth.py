@@ -123,8 +123,9 @@ def fit_prior(
 ) -> PriorFit:
     """Measure s_f by least squares between gradients on the ring (METHOD section 3).
 
-    With a noisy prior the best s_f is below the true gain, which is what least squares gives. 0 where the prior
-    says nothing: too few pixels, no variance, no or negative agreement.
+    Mean gradients are left out: a slope is harmonic, so it needs no prior and says nothing about one. With a noisy
+    prior the best s_f is below the true gain, which is what least squares gives. 0 where the prior says nothing: too
+    few pixels, no variance, no or negative agreement.
     """
     ring = known & (disparity > 0) & np.isfinite(prior)
     if on_ring:
@@ -132,8 +133,10 @@ def fit_prior(
     k, pairs = settings.gradient_step, []
     for near, far in ((np.s_[:, :-k], np.s_[:, k:]), (np.s_[:-k], np.s_[k:])):
         both = ring[near] & ring[far]
-        pairs.append(np.stack([(prior[far] - prior[near])[both], (disparity[far] - disparity[near])[both]]))
-    m, d = np.concatenate(pairs, axis=1).astype(np.float64)
+        if both.any():
+            steps = np.stack([(prior[far] - prior[near])[both], (disparity[far] - disparity[near])[both]])
+            pairs.append(steps - steps.mean(axis=1, keepdims=True))
+    m, d = np.concatenate([np.zeros((2, 0)), *pairs], axis=1)
     if len(m) < settings.minimum_ring:
         return PriorFit(0.0, 0.0, 0.3, "harmonic: too little is known round the hole to scale the prior")
 
@@ -181,8 +184,14 @@ def background_rim(
     background = heights[far_first][np.searchsorted(reached, (1 - settings.occluder_share) * reached[-1])]
     nearer = (1 + settings.layer_jump) * background
     occluder = beside_jump & (heights > nearer)
-    dropped = np.isin(layers, numbers[occluder]) | (jumps & (disparity > nearer) & occluder.any())
-    return known & ~dropped
+    front = np.isin(layers, numbers[occluder])
+    # Of the step's own pixels, those on its upper half belong to the occluder.
+    top = scipy.ndimage.maximum_filter(np.where(known, disparity, -np.inf), 5)
+    bottom = scipy.ndimage.minimum_filter(np.where(known, disparity, np.inf), 5)
+    with np.errstate(invalid="ignore"):
+        upper = disparity > (top + bottom) / 2
+    edge = jumps & scipy.ndimage.binary_dilation(front, AROUND, iterations=2) & upper
+    return known & ~front & ~edge
 
 
 def _jumps(disparity: np.ndarray, known: np.ndarray, band: np.ndarray, threshold: float) -> np.ndarray:
