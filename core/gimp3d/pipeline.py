@@ -71,6 +71,7 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", support=0.0),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=float("inf")),
         propagate=PropagateSettings(transfer="sample"),
+        seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,
         extra_references=0,
     ),

@@ -42,6 +42,7 @@ REFUSED = {
     },
     "orthographic": {"ORTHOGRAPHIC", "ORTHOPHOTO"},
 }
+PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 COLMAP_MODELS = (  # by their numbers in cameras.bin
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -252,8 +253,12 @@ def _image_size(photo: Path, where: str) -> tuple[int, int]:
 
 
 def _photo(folder: Path, name: str) -> Path:
+    """The photo of a camera; names without an extension (Inria's, the original NeRF's) take the file that is there."""
     path = folder / name
-    return path if path.suffix or path.exists() else path.with_name(path.name + ".png")
+    if path.suffix.lower() in PHOTOS or path.exists():
+        return path
+    candidates = [path.with_name(path.name + e) for e in (*PHOTOS, *(e.upper() for e in PHOTOS))]
+    return next((c for c in candidates if c.exists()), candidates[0])
 
 
 def _distortion(coefficients: Sequence[Any], where: str) -> Distortion:

@@ -77,6 +77,17 @@ def test_inria_cameras_agree_where_the_principal_point_is_central(views: tuple[C
         assert (got.cx, got.cy) == (60, 45)
 
 
+@pytest.mark.parametrize("extension", [".png", ".jpg", ".JPG"])
+def test_names_without_an_extension_find_their_photo(extension: str, views: tuple[Camera, ...], tmp_path: Path) -> None:
+    bare = [
+        Camera("a.b/photo 1", *[getattr(views[0], f) for f in ("width", "height", "fx", "fy", "cx", "cy", "viewmat")])
+    ]
+    write_transforms(tmp_path / "t.json", bare)
+    (tmp_path / "a.b").mkdir()
+    (tmp_path / "a.b" / f"photo 1{extension}").touch()
+    assert read_cameras(tmp_path / "t.json")[0].image == tmp_path / "a.b" / f"photo 1{extension}"
+
+
 def test_transforms_are_opengl_axes(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = [0, 0, 5]  # at z = 5, looking down −z, y up
