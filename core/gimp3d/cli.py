@@ -73,7 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD",
     )
     remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH")
-    remove.add_argument("--preset", choices=("draft", "balanced", "best", "paper", "paper-literal"), default="balanced")
+    remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
     remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
     remove.add_argument("--views-out", metavar="DIR", help="write every completed view")
     remove.add_argument("--report", metavar="DIR", help="write an HTML report with stage pictures")
@@ -289,6 +289,8 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
     )
     if given.json:
         write_atomically(Path(given.json), lambda f: f.write(json.dumps(scores, indent=1).encode()))
+    for warning in scores["warnings"]:
+        print(f"gimp3d: warning: {warning}", file=sys.stderr)
     print(f"{'view':<20} {'PSNR dB':>8} {'SSIM':>7} {'FLIP':>7}")
     for name, row in [*scores["views"].items(), ("mean", scores["mean"])]:
         print(f"{name:<20} {row['psnr']:8.2f} {row['ssim']:7.3f} {row['flip']:7.3f}")

@@ -212,6 +212,10 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
     BadInput
         If a key of --set does not exist or its value is of the wrong type.
     """
+    if job.preset not in PRESETS:
+        raise BadInput(f"--preset: {job.preset!r} is not in this version; use {', '.join(PRESETS)}")
+    if not 0 <= job.seed < 1 << 32:
+        raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
     settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
     for key, text in job.set.items():
         settings = _with(settings, key.split("."), text, key)

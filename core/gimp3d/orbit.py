@@ -28,7 +28,7 @@ def orbit_cameras(
     Raises
     ------
     BadInput
-        If the up direction is zero, or a count, size or angle makes no sense.
+        If the up direction is zero, the region is empty, or a count, size or angle makes no sense.
     """
     axis = np.asarray(up, dtype=np.float64)
     if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:
@@ -39,12 +39,17 @@ def orbit_cameras(
         raise BadInput(f"orbit: the field of view must lie between 1 and 170 degrees, got {fov_degrees}")
     if not (0 < width < 1 << 16 and 0 < height < 1 << 16):
         raise BadInput(f"orbit: an image of {width}×{height} pixels makes no sense")
+    if not region:
+        raise BadInput("orbit: no region to look at; give at least one box")
     axis /= np.linalg.norm(axis)
     corners = np.concatenate([box.corners() for box in region])
     centre = (corners.min(0) + corners.max(0)) / 2
     radius = float(np.linalg.norm(corners - centre, axis=1).max())
     focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
-    distance = radius * 2 * focal / (FILL * min(width, height))
+    half_picture = FILL * min(width, height) / 2
+    distance = radius * math.hypot(
+        1, focal / half_picture
+    )  # a sphere's outline; stays outside it however wide the lens
     side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
     front = np.cross(axis, side)

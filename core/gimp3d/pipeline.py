@@ -69,7 +69,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", support=0.0),
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=float("inf")),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
         propagate=PropagateSettings(transfer="sample"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,

@@ -28,6 +28,35 @@ def test_all_cameras_frame_the_region_from_above_and_outside(up: tuple[float, fl
         assert 2 * np.degrees(np.arctan(160 / camera.fx)) == pytest.approx(60)
 
 
+@pytest.mark.parametrize("fov", [1.5, 50, 120, 169])
+@pytest.mark.parametrize(("width", "height"), [(320, 200), (90, 160)])
+def test_the_regions_sphere_fills_two_fifths_of_the_smaller_side(fov: float, width: int, height: int) -> None:
+    box = Box.make([1, 2, 3], [0.4, 0.8, 0.2])
+    radius = np.linalg.norm(box.size) / 2
+    for camera in orbit_cameras((box,), 6, (0, 0, 1), width, height, fov):
+        distance = np.linalg.norm(camera.centre - box.center)
+        outline = camera.fx * np.tan(np.arcsin(radius / distance))  # of a sphere on the optical axis, pixels
+        assert outline == pytest.approx(0.4 * min(width, height) / 2)
+        assert camera.project(box.center)[0] == pytest.approx([width / 2, height / 2])
+
+
+def test_orbits_are_the_same_every_time_and_spread_over_three_rings() -> None:
+    box = Box.make([0, 0, 0], [1, 1, 1])
+    first, second = orbit_cameras((box,), 12), orbit_cameras((box,), 12)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.viewmat, b.viewmat)
+    assert [c.id for c in first[:2]] == ["orbit/000", "orbit/001"]
+    away = np.array([c.centre / np.linalg.norm(c.centre) for c in first])
+    assert {round(e) for e in np.degrees(np.arcsin(away[:, 2]))} == {15, 35, 60}
+    angles = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])) % 360)
+    np.testing.assert_allclose(np.diff(angles), 30, atol=1e-9)
+
+
+def test_an_orbit_round_nothing_is_refused() -> None:
+    with pytest.raises(BadInput, match="at least one box"):
+        orbit_cameras(())
+
+
 @pytest.mark.parametrize(
     "change",
     [{"up": (0, 0, 0)}, {"count": 0}, {"fov_degrees": 0.5}, {"fov_degrees": 180}, {"width": 0}, {"up": (np.nan, 0, 0)}],

@@ -139,6 +139,17 @@ def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -
     assert (read_image(tmp_path / "views" / f"{reference.id}.png").shape) == (90, 120, 3)
 
 
+@pytest.mark.parametrize("preset", ["draft", "balanced", "best", "paper"])
+def test_every_preset_runs_and_its_summary_is_strict_json(preset: str, scene_folder: Path, tmp_path: Path) -> None:
+    remove(scene_folder, tmp_path / "out.ply", "--preset", preset, "--summary", str(tmp_path / "s.json"))
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is not JSON")
+
+    summary = json.loads((tmp_path / "s.json").read_text(), parse_constant=refuse)
+    assert summary["counts"]["added"] > 0 and summary["settings"]["preset"] == preset
+
+
 def test_render_masks_orbit_evaluate_and_info(
     scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -261,6 +272,8 @@ BAD = {
     "setting of a wrong type": (
         [*f"{REMOVE} --set seed.opacity=much".split()], 2, "takes a float",
     ),
+    "a preset of a later version": (f"{REMOVE} --preset paper-literal".split(), 2, "not in this version"),
+    "negative seed": (f"{REMOVE} --seed -1".split(), 2, "--seed"),
     "no CUDA": ([*f"{REMOVE} --device cuda".split()], 2, "CUDA"),
     "no job there": (["remove", "--job", "nowhere"], 2, "job.json"),
     "no threads": ([*f"{RENDER} --threads 0".split()], 2, "--threads"),

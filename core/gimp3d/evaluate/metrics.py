@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -15,6 +15,7 @@ from ..io.images import read_image, read_mask
 PIXELS_PER_DEGREE = 67.0  # FLIP's default viewing condition
 PSNR_OF_EQUAL = 100.0  # dB reported for identical pictures, as JSON knows no infinity
 SSIM_SIGMA, SSIM_SIDE = 1.5, 11  # Wang et al. 2004
+PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr"}  # what a camera's ID may end in
 
 
 def psnr(
@@ -90,7 +91,8 @@ def evaluate_folders(
     """Scores of every picture that both folders have: {"views": {stem: {psnr, ssim, flip}}, "mean", "warnings"}.
 
     A picture's stem is its path below `pred` without .png; its mask is stem + suffix, else stem.png. Excluded are
-    stems, with or without extension and leading folders (test/000.png, test/000 and 000 all name 000.png).
+    stems or camera IDs, with or without extension and leading folders (test/000.jpg, test/000 and 000 all name
+    000.png). A true picture with a mask that nobody predicted is a warning: a mean must not rise by leaving views out.
 
     Raises
     ------
@@ -100,12 +102,14 @@ def evaluate_folders(
     for folder in (pred, truth, masks):
         if not folder.is_dir():
             raise BadInput(f"evaluate: {folder} is not a folder")
-    left_out = {e.removesuffix(".png") for e in exclude}
+    left_out = {e: _stem_of_id(e) for e in exclude}
+    unused = set(left_out)
     views: dict[str, dict[str, float]] = {}
     warnings: list[str] = []
     for path in sorted(pred.rglob("*.png")):
         stem = path.relative_to(pred).as_posix().removesuffix(".png")
-        if any(stem == e or e.endswith("/" + stem) or stem.endswith("/" + e) for e in left_out):
+        if named := [e for e, excluded in left_out.items() if _same_view(stem, excluded)]:
+            unused.difference_update(named)
             continue
         true = truth / f"{stem}.png"
         mask_path = next((m for m in (masks / f"{stem}{mask_suffix}", masks / f"{stem}.png") if m.exists()), None)
@@ -121,5 +125,22 @@ def evaluate_folders(
         views[stem] = score(picture, answer, mask)
     if not views:
         raise BadInput(f"evaluate: no picture of {pred} has a truth in {truth} and a mask in {masks}")
+    warnings += [f"exclude: {e} names no picture of {pred}" for e in sorted(unused)]
+    for path in sorted(truth.rglob("*.png")):
+        stem = path.relative_to(truth).as_posix().removesuffix(".png")
+        missing = (masks / f"{stem}{mask_suffix}").exists() and not (pred / f"{stem}.png").exists()
+        if missing and not any(_same_view(stem, e) for e in left_out.values()):
+            warnings.append(f"{stem}: no picture in {pred}, not scored")
     mean = {k: float(np.mean([v[k] for v in views.values()])) for k in ("psnr", "ssim", "flip")}
     return {"views": views, "mean": mean, "warnings": warnings}
+
+
+def _stem_of_id(camera_id: str) -> str:
+    """The stem that `render` gives a camera's picture: test/000 for ./test/000.jpg."""
+    path = PurePosixPath(camera_id)
+    return str(path.with_suffix("") if path.suffix.lower() in PHOTO_SUFFIXES else path)
+
+
+def _same_view(stem: str, excluded: str) -> bool:
+    """Whether two stems name one picture, either possibly with more leading folders."""
+    return stem == excluded or excluded.endswith("/" + stem) or stem.endswith("/" + excluded)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +30,11 @@ def test_ssim_against_the_definition() -> None:
     window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * 1.5**2))
     window /= window.sum()
     found = ssim_map(PICTURE, other)
-    for y, x in ((5, 5), (20, 30), (34, 44)):
+    padded = [np.pad(p.astype(float) / 255, ((5, 5), (5, 5), (0, 0)), "reflect") for p in (PICTURE, other)]
+    for y, x in ((0, 0), (2, 49), (39, 20), (5, 5), (20, 30), (34, 44)):
         expected = []
         for c in range(3):
-            a, b = (p[y - 5 : y + 6, x - 5 : x + 6, c].astype(float) / 255 for p in (PICTURE, other))
+            a, b = (p[y : y + 11, x : x + 11, c] for p in padded)
             ma, mb = (window * a).sum(), (window * b).sum()
             va, vb, co = (
                 (window * a * a).sum() - ma**2,
@@ -69,11 +72,49 @@ def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
     return tuple(tmp_path / n for n in names)  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("excluded", ["test/000.png", "test/000", "000", "000.png"])
+@pytest.mark.parametrize("excluded", ["test/000.png", "test/000", "000", "000.png", "./test/000.JPG", "000.jpg"])
 def test_views_pair_up_and_exclusions_take_any_form(folders: tuple[Path, Path, Path], excluded: str) -> None:
     assert set(evaluate_folders(*folders, exclude=(excluded,))["views"]) == {"test/001", "test/002"}
     inner = [f / "test" for f in folders]
-    assert set(evaluate_folders(*inner, exclude=(excluded,))["views"]) == {"001", "002"}
+    result = evaluate_folders(*inner, exclude=(excluded,))
+    assert set(result["views"]) == {"001", "002"} and not result["warnings"]
+
+
+def test_views_left_out_without_being_excluded_are_named(folders: tuple[Path, Path, Path]) -> None:
+    (folders[0] / "test" / "002.png").unlink()
+    result = evaluate_folders(*folders, exclude=("test/007.png", "000"))
+    assert set(result["views"]) == {"test/001"}
+    typo, missing = result["warnings"]
+    assert "test/007.png names no picture" in typo and missing.startswith("test/002: no picture")
+
+
+def test_a_plain_mask_name_serves_where_the_suffixed_one_is_missing(folders: tuple[Path, Path, Path]) -> None:
+    mask = folders[2] / "test" / "001.mask.png"
+    mask.rename(mask.with_name("001.png"))
+    assert set(evaluate_folders(*folders)["views"]) == {"test/000", "test/001", "test/002"}
+
+
+def test_scores_are_means_over_the_mask_then_over_views(folders: tuple[Path, Path, Path]) -> None:
+    mask = np.zeros((40, 50), bool)
+    mask[3:20, 5:30] = True
+    dark = PICTURE // 2
+    write_png(folders[0] / "test" / "001.png", dark)
+    write_png(folders[2] / "test" / "001.mask.png", mask)
+    result = evaluate_folders(*folders, exclude=("000",))
+    found = result["views"]["test/001"]
+    error = ((dark.astype(float) - PICTURE)[mask] ** 2).mean()
+    assert found["psnr"] == pytest.approx(10 * np.log10(255**2 / error))
+    assert found["ssim"] == pytest.approx(ssim_map(dark, PICTURE)[mask].mean())
+    assert found["flip"] == pytest.approx(flip_map(dark, PICTURE)[mask].mean())
+    for metric, equal in (("psnr", 100), ("ssim", 1), ("flip", 0)):
+        assert result["mean"][metric] == pytest.approx((found[metric] + equal) / 2, abs=1e-6)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+
+
+def test_flip_without_its_package_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    with pytest.raises(BadInput, match=r"gimp3d\[evaluate\]"):
+        flip_map(PICTURE, PICTURE)
 
 
 def test_empty_masks_are_skipped_with_a_warning(folders: tuple[Path, Path, Path]) -> None:
