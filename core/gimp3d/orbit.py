@@ -47,9 +47,8 @@ def orbit_cameras(
     radius = float(np.linalg.norm(corners - centre, axis=1).max())
     focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
     half_picture = FILL * min(width, height) / 2
-    distance = radius * math.hypot(
-        1, focal / half_picture
-    )  # a sphere's outline; stays outside it however wide the lens
+    # where a sphere's outline has that size; unlike size · focal / pixels it stays outside the sphere with wide lenses
+    distance = radius * math.hypot(1, focal / half_picture)
     side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
     front = np.cross(axis, side)
