@@ -266,7 +266,7 @@ BAD = {
     "unknown provider": ([*f"{REMOVE} --inpaint magic".split()], 2, "unknown provider"),
     "unknown prior": ([*f"{REMOVE} --depth-prior magic".split()], 2, "unknown provider"),
     "failing command": (
-        [*f"{REMOVE} --set use_evidence=false --inpaint".split(), "command:false"], 2, "ended with 1",
+        [*f"{REMOVE} --set use_evidence=false --inpaint".split(), "command:false {out}"], 2, "ended with 1",
     ),
     "unknown setting": ([*f"{REMOVE} --set a.b=1".split()], 2, "no setting"),
     "setting of a wrong type": (
