@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -147,6 +148,7 @@ def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictur
         for words, colour in RULE_COLOURS.values()
     )
     warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
+    settings = text(json.dumps(summary["settings"], indent=1))
     numbers = "".join(f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>" for k, v in counts.items())
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
@@ -156,5 +158,6 @@ def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictur
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
         f"<h2>What each stage saw</h2><p>{legend}</p><div class=grid>{stages}</div>"
-        f"<h2>Counts</h2><table>{numbers}</table></html>\n"
+        f"<h2>Counts</h2><table>{numbers}</table>"
+        f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
     )

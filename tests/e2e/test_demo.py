@@ -1,4 +1,4 @@
-"""The demo's scene is what its script makes, and `make demo` does what it says."""
+"""`make demo` does what it says."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from gimp3d.box import in_region, read_region
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import read_image
 from gimp3d.io.ply import read_ply
@@ -18,24 +16,6 @@ from gimp3d.pipeline import render_bytes
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "assets" / "demo"
 MAKE = [sys.executable, str(ROOT / "scripts" / "make_demo_scene.py")]
-
-
-def test_the_committed_scene_is_what_the_script_makes(tmp_path: Path) -> None:
-    subprocess.run([*MAKE, "--folder", str(tmp_path)], check=True)
-    for name in ("transforms.json", "roi.json"):
-        assert (tmp_path / name).read_text() == (DEMO / name).read_text()
-    made, kept = (read_ply(f / "scene.ply").gaussians for f in (tmp_path, DEMO))
-    for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
-        np.testing.assert_allclose(getattr(made, name), getattr(kept, name), atol=1e-4)
-    assert sum(p.stat().st_size for p in DEMO.iterdir()) < 5 * 2**20
-
-
-def test_the_vase_is_in_the_box_and_nothing_lies_under_it() -> None:
-    g, region = read_ply(DEMO / "scene.ply").gaussians, read_region(DEMO / "roi.json")
-    inside = g.means[in_region(region, g.means.astype(float))]
-    assert len(inside) > 2000 and inside[:, 2].max() > 0.3
-    near = np.linalg.norm(inside[:, :2] - region[0].center[:2], axis=1) < 0.09
-    assert not (inside[near, 2] < 0.003).any()
 
 
 def test_the_demo_removes_the_vase(tmp_path: Path) -> None:

@@ -1,0 +1,61 @@
+"""The report page: complete, self-contained, and safe to open."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import REGION, cameras, scene
+
+from gimp3d.io.images import read_image
+from gimp3d.pipeline import Picture, RemovalSettings, View, remove_object, render_bytes
+from gimp3d.report import draw, write_removal_report
+from gimp3d.stages.propagate import Rule
+
+IMAGE = np.full((20, 30, 3), 90, np.uint8)
+HERE = np.zeros((20, 30), bool)
+HERE[5:12, 8:20] = True
+
+
+def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
+    views = [View(c, render_bytes(scene(), c)) for c in cameras(4)]
+    result = remove_object(scene(), views, REGION, RemovalSettings(extra_references=0))
+    summary = {
+        "version": "0",
+        "seconds_total": 1.0,
+        "peak_memory_mb": 10.0,
+        "stages": [
+            {"name": s.name, "seconds": s.seconds, "confidence": s.confidence, "reason": "<b>"} for s in result.stages
+        ],
+        "counts": {"removed": 5, "added": 6},
+        "settings": {"inpaint": "file:<x>"},
+        "warnings": ["<script>alert(1)</script>"],
+    }
+    page = write_removal_report(tmp_path, scene(), views, result, summary).read_text()
+    pictures = re.findall(r"src='([^']+)'", page)
+    assert len(pictures) >= 2 * 4 + 6 and len(set(pictures)) == len(pictures)
+    for name in pictures:
+        assert read_image(tmp_path / name).size > 0
+    assert "<script" not in page and "&lt;script&gt;" in page and "&lt;b&gt;" in page and "file:&lt;x&gt;" in page
+    assert not re.search(r"(src|href)='(https?:|//)", page)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        Picture("mask", "", IMAGE, (HERE,)),
+        Picture("depth", "", IMAGE, (np.where(HERE, 0, 2.0), HERE)),
+        Picture("depth", "", IMAGE, (np.zeros((20, 30)), HERE)),
+        Picture("appearance", "", IMAGE, (HERE,)),
+        Picture("mapping", "", IMAGE, (np.where(HERE, 3, -1), np.where(HERE, 4, -1))),
+        Picture("mapping", "", IMAGE, (np.full((20, 30), -1), np.full((20, 30), -1))),
+        Picture("rules", "", IMAGE, (np.where(HERE, Rule.OWN_PIXELS, Rule.UNTOUCHED),)),
+    ],
+)
+def test_every_kind_of_picture_is_drawn(picture: Picture) -> None:
+    drawn = draw(picture)
+    assert drawn.dtype == np.uint8 and drawn.shape[0] == 20 and drawn.shape[2] == 3
+    if picture.data[0].any() and picture.kind != "depth":
+        assert (drawn[:, :30] != IMAGE).any() or (drawn[:, 30:] != IMAGE).any()
