@@ -13,11 +13,12 @@ from bpy_extras.object_utils import world_to_camera_view
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mathutils import Euler, Matrix, Vector
-from scenes import cameras
+from scenes import cameras, scene
 
 from gimp3d.box import Box
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras, write_transforms
+from gimp3d.pipeline import render_bytes
 from gimp3d_addon import bridge
 
 NO_FIXTURE_CHECK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -82,6 +83,8 @@ def test_the_same_camera_from_a_file_and_through_blender(tmp_path: Path) -> None
         back = read(obj, np.array(frame))
         assert np.allclose(back.K, camera.K, rtol=1e-12) and back.id == camera.id
         assert np.abs(back.viewmat - camera.viewmat).max() < 2e-5  # Blender's matrices are float32
+        pictures = [render_bytes(scene(), c).astype(int) for c in (camera, back)]
+        assert np.abs(pictures[0] - pictures[1]).max() <= 1
         del obj[bridge.CAMERA]  # and what Blender itself frames is the same picture
         render = bpy.context.scene.render
         render.resolution_x, render.resolution_y, render.resolution_percentage = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 
 import bpy
@@ -17,7 +18,7 @@ from gimp3d.errors import Gimp3dError
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
-from gimp3d_addon import panels, splats
+from gimp3d_addon import jobs, panels, splats
 from gimp3d_addon.worker import Worker
 
 
@@ -160,10 +161,22 @@ def test_without_a_scene_the_operators_say_what_is_missing() -> None:
         assert not getattr(bpy.ops.gimp3d, name).poll()
 
 
-def test_a_cancelled_worker_ends_at_once() -> None:
-    worker = Worker(["--version"])
+def test_a_cancelled_worker_ends_at_once(folder: Path) -> None:
+    prepare(folder)
+    job = folder / "job"
+    jobs.write_job(bpy.context, job)
+    worker = Worker(["remove", "--job", str(job), "--progress", "json"])
+    start = time.perf_counter()
+    while worker.status == "starting" and time.perf_counter() < start + 60:
+        worker.poll()
+    start = time.perf_counter()
     worker.cancel()
-    assert worker.poll() or worker.poll()
+    assert time.perf_counter() - start < 1
+    while not worker.poll():
+        assert time.perf_counter() - start < 5
+    with pytest.raises(Gimp3dError):
+        worker.result()
+    assert not (job / "out.ply").exists()
 
 
 def test_a_killed_worker_says_so() -> None:
