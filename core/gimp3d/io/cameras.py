@@ -255,6 +255,8 @@ def _image_size(photo: Path, where: str) -> tuple[int, int]:
 def _photo(folder: Path, name: str) -> Path:
     """The photo of a camera; names without an extension (Inria's, the original NeRF's) take the file that is there."""
     path = folder / name
+    if not path.exists() and not path.parent.is_dir() and (folder / path.name).exists():
+        return folder / path.name  # --images names the very folder that the camera's name begins with
     if path.suffix.lower() in PHOTOS or path.exists():
         return path
     candidates = [path.with_name(path.name + e) for e in (*PHOTOS, *(e.upper() for e in PHOTOS))]

@@ -88,6 +88,14 @@ def test_names_without_an_extension_find_their_photo(extension: str, views: tupl
     assert read_cameras(tmp_path / "t.json")[0].image == tmp_path / "a.b" / f"photo 1{extension}"
 
 
+def test_the_photo_folder_may_be_the_one_that_names_begin_with(views: tuple[Camera, ...], tmp_path: Path) -> None:
+    write_transforms(tmp_path / "t.json", views)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a photo 0.png").touch()
+    found = read_cameras(tmp_path / "t.json", tmp_path / "elsewhere")
+    assert found[0].image == tmp_path / "elsewhere" / "a photo 0.png"
+
+
 def test_transforms_are_opengl_axes(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[:3, 3] = [0, 0, 5]  # at z = 5, looking down −z, y up
