@@ -43,6 +43,6 @@ numba.config.CACHE_DIR = str(kernel_cache)
 
 kernel = numba.njit(nogil=True, cache=True, fastmath=True, error_model="numpy", boundscheck=False)
 # For kernels that must see NaN and infinity as such:
-exact_kernel = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
+exact_kernel = numba.njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy", boundscheck=False)
 # For small functions used inside kernels:
 inline_kernel = numba.njit(nogil=True, fastmath=True, error_model="numpy", boundscheck=False, inline="always")

@@ -1,156 +1,230 @@
-"""Which ellipses each 16×16 tile has to blend, front to back.
+"""Which Gaussians each tile has to blend, front to back.
 
-The Gaussians are sorted by depth once; a stable counting scatter then deals them into tiles. The lists do not
+The drawn Gaussians are sorted by depth once; a stable counting scatter then deals them into tiles. The lists do not
 depend on how the work is cut into chunks.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
-from numba import float64, int64
+from numba import float32, int64, uint64
 
-from ..jit import exact_kernel, inline_kernel, kernel
+from ..jit import exact_kernel, inline_kernel
 from ..threads import parallel_map, thread_count
 from .project import (
+    BOUND_X,
+    BOUND_Y,
     DEPTH,
     DRAWN,
-    FEATURES,
+    HALF,
     HALF_HEIGHT,
-    MEAN_X,
-    MEAN_Y,
     TILE,
     WHITEN_XX,
     WHITEN_XY,
     WHITEN_YY,
+    ZERO,
 )
-from .vec16 import prefetch
+from .vec16 import floor16, fma16, load1, lowest_bit, max16, min16, prefetch, ramp16, spans_to_bits, splat16, sqrt16, where_greater
 
-RADIX_BITS = 11
-AHEAD = 16  # feature rows to prefetch: in depth order each is a cache miss
-ROWS_PER_CHUNK = 4096  # fewer Gaussians than this are not worth a thread
+AHEAD = 16  # rows to prefetch: in depth order each is a cache miss
+CELLS = 8  # a mask has a bit for each of 8×8 cells
+MOST_DIGIT_BITS = 12  # of the radix sort: 4096 counters fit into a core's nearest cache
+ROWS_PER_CHUNK = 8192  # fewer Gaussians than this are not worth a thread
+FIRST_COLUMN = np.uint64(0x0101010101010101)  # of a mask of cells
+ONE, EIGHT, CELL = np.float32(1), np.float32(CELLS), np.float32(TILE)
+SLACK_PX, SLACK = np.float32(0.01), np.float32(5e-4)  # of the bound, for float32's rounding: at worst √(2·6e-8)
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Slot s is tile `tiles[s]`; it blends entries[starts[s]:starts[s + 1]], near to far."""
+
+    tiles: np.ndarray  # [S] int32, row-major tile numbers
+    starts: np.ndarray  # [S+1] int64
+    entries: np.ndarray  # [P] int32, rows of features
+    counts: np.ndarray  # [N] int32, tiles that each Gaussian is in; empty if records were not asked for
+    records: np.ndarray  # [P] int64, each entry's own row for sums: a Gaussian's are consecutive; −1: not recorded
 
 
 def tile_lists(
-    features: np.ndarray,  # [N, 16] float32
+    features: np.ndarray,  # [N, 16 or 32] float32
+    rects: np.ndarray,  # [N, 4] int16
     states: np.ndarray,  # [N] int8
-    across: int,  # tiles per row of tiles
-    down: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """(starts [T+1] int64, entries [P] int32): tile t blends entries[starts[t]:starts[t+1]], near to far."""
-    order = _depth_order(features, states)
-    chunks = max(1, min(thread_count(), len(order) // ROWS_PER_CHUNK))
-    bounds = [len(order) * k // chunks for k in range(chunks + 1)]
-    counts = np.zeros((chunks, across * down), np.int64)
-    parallel_map(lambda k: _count(bounds[k], bounds[k + 1], order, features, across, down, counts[k]), range(chunks))
-    ends = np.cumsum(counts.T).reshape(across * down, chunks)  # tile by tile, and in a tile chunk by chunk
-    places = np.ascontiguousarray(ends.T) - counts
-    starts = np.append(places[0], ends[-1, -1])
-    entries = np.empty(starts[-1], np.int32)
-    parallel_map(
-        lambda k: _scatter(bounds[k], bounds[k + 1], order, features, across, down, places[k], entries),
-        range(chunks),
-    )
-    return starts, entries
+    slots: np.ndarray,  # [down, across] int32: a tile's slot, −1 where it is not wanted
+    with_records: bool,
+) -> TileLists:
+    """Deal the drawn Gaussians into the wanted tiles."""
+    order = depth_order(features, states)
+    tiles = np.flatnonzero(slots.ravel() >= 0).astype(np.int32)
+    bounds = _chunks(len(order))
+    counts = np.zeros((len(bounds) - 1, len(tiles)), np.int64)
+    per_row = np.zeros(len(states) if with_records else 0, np.int32)
+    next_record, records, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int32)
+
+    def deal(k: int) -> None:
+        places = counts[k]
+        _deal(bounds[k], bounds[k + 1], order, features, rects, slots, places, entries, per_row, next_record, records)
+
+    parallel_map(deal, range(len(bounds) - 1))
+    ends = np.cumsum(counts.T).reshape(counts.T.shape)  # tile by tile, and in a tile chunk by chunk
+    counts = np.ascontiguousarray(ends.T) - counts  # from here on: where each chunk writes its next entry
+    starts = np.zeros(len(tiles) + 1, np.int64)
+    starts[1:] = ends[:, -1]
+    if starts[-1]:
+        entries = np.empty(starts[-1], np.int32)
+        if with_records:
+            records, next_record = np.empty(starts[-1], np.int64), np.cumsum(per_row, dtype=np.int64) - per_row
+        parallel_map(deal, range(len(bounds) - 1))
+    return TileLists(tiles, starts, entries, per_row, records)
 
 
-def _depth_order(
-    features: np.ndarray,  # [N, 16] float32
+def _chunks(count: int) -> list[int]:
+    chunks = max(1, min(thread_count(), count // ROWS_PER_CHUNK))
+    return [count * k // chunks for k in range(chunks + 1)]
+
+
+def depth_order(
+    features: np.ndarray,  # [N, 16 or 32] float32
     states: np.ndarray,  # [N] int8
 ) -> np.ndarray:
-    """Drawn rows from near to far, rows of equal depth in file order, [D] int32."""
-    rows, keys = np.empty((2, 2, len(states)), np.int32)
-    drawn = _radix_sort(features.view(np.int32), states, rows, keys)  # positive floats sort like their bits
-    return rows[1, :drawn]
+    """Drawn rows from near to far, rows of equal depth in file order, [D] int32.
+
+    A least-significant-digit radix sort of the float32 depths, whose bits sort like their values (they are positive);
+    digits cover only the bits in which the depths differ.
+    """
+    bounds = _chunks(len(states))
+    chunks = range(len(bounds) - 1)
+    drawn = [_count_drawn(states, bounds[k], bounds[k + 1]) for k in chunks]
+    starts = np.concatenate([[0], np.cumsum(drawn)])
+    total = int(starts[-1])
+    rows, keys = np.empty((2, total), np.int32), np.empty((2, total), np.int32)
+    parallel_map(
+        lambda k: _gather_keys(bounds[k], bounds[k + 1], features.view(np.int32), states, starts[k], rows[0], keys[0]),
+        chunks,
+    )
+    if not total:
+        return rows[0]
+    bounds = _chunks(total)
+    chunks = range(len(bounds) - 1)
+    lowest = int(keys[0].min())
+    bits = (int(keys[0].max()) - lowest).bit_length()
+    passes = -(-bits // MOST_DIGIT_BITS)
+    for p in range(passes):
+        width = -(-bits // passes)
+        counts = np.zeros((len(bounds) - 1, 1 << width), np.int32)
+        a, b = p % 2, 1 - p % 2
+        parallel_map(
+            lambda k: _count_digits(bounds[k], bounds[k + 1], keys[a], lowest, p * width, counts[k]), chunks
+        )
+        ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
+        places = np.ascontiguousarray(ends.T) - counts
+        parallel_map(
+            lambda k: _scatter_digits(
+                bounds[k], bounds[k + 1], keys[a], rows[a], lowest, p * width, places[k], keys[b], rows[b]
+            ),
+            chunks,
+        )
+    return rows[passes % 2]
 
 
-@kernel
-def _radix_sort(feature_bits, states, rows, keys):
-    """Three passes of 11 bits, least significant first, between two buffers; the result lies in rows[1]."""
-    n = 0
-    for i in range(len(states)):
+@exact_kernel
+def _count_drawn(states, lo, hi):
+    count = 0
+    for i in range(lo, hi):
+        count += states[i] == DRAWN
+    return count
+
+
+@exact_kernel
+def _gather_keys(lo, hi, feature_bits, states, place, rows, keys):
+    for i in range(lo, hi):
         if states[i] == DRAWN:
-            rows[0, n] = i
-            keys[0, n] = feature_bits[i, DEPTH]
-            n += 1
-    size = 1 << RADIX_BITS
-    starts = np.zeros((3, size), np.int32)
-    for i in range(n):
-        for p in range(3):
-            starts[p, (keys[0, i] >> (RADIX_BITS * p)) & (size - 1)] += 1
-    for p in range(3):
-        total = 0
-        for digit in range(size):
-            count = starts[p, digit]
-            starts[p, digit] = total
-            total += count
-        source, target = p % 2, 1 - p % 2
-        for i in range(n):
-            key = keys[source, i]
-            digit = (key >> (RADIX_BITS * p)) & (size - 1)
-            place = starts[p, digit]
-            starts[p, digit] = place + 1
-            keys[target, place] = key
-            rows[target, place] = rows[source, i]
-    return n
-
-
-@inline_kernel
-def _tile_range(low, high, tiles):
-    """First tile, and one past the last, with a pixel centre between low and high (px)."""
-    first = min(max(math.ceil((low - (TILE - 0.5)) / TILE), 0.0), float64(tiles))
-    end = min(max(math.floor((high - 0.5) / TILE) + 1.0, 0.0), float64(tiles))
-    return int64(first), int64(end)
-
-
-@inline_kernel
-def _tile_rows(f, down):
-    """Rows of tiles that the ellipse of feature row f reaches."""
-    mean_y, half_height = float64(f[MEAN_Y]), float64(f[HALF_HEIGHT])
-    return _tile_range(mean_y - half_height, mean_y + half_height, down)
-
-
-@inline_kernel
-def _tile_columns(f, tile_y, across):
-    """Tiles of row tile_y that the ellipse of feature row f reaches, exactly."""
-    xx, xy, yy = float64(f[WHITEN_XX]), float64(f[WHITEN_XY]), float64(f[WHITEN_YY])
-    mean_x, half_height = float64(f[MEAN_X]), float64(f[HALF_HEIGHT])
-    radius = half_height * yy
-    top = tile_y * TILE + 0.5 - f[MEAN_Y]
-    low, high = max(top, -half_height), min(top + (TILE - 1.0), half_height)
-    # the ellipse reaches furthest right at dy = tip and furthest left at dy = −tip
-    tip = -xy * radius / (yy * math.sqrt(xy * xy + yy * yy))
-    right, left = min(max(tip, low), high), min(max(-tip, low), high)
-    reach_right = math.sqrt(max(radius * radius - (yy * right) ** 2, 0.0)) - xy * right
-    reach_left = math.sqrt(max(radius * radius - (yy * left) ** 2, 0.0)) + xy * left
-    return _tile_range(mean_x - reach_left / xx, mean_x + reach_right / xx, across)
-
-
-# Not fast-math: both must come to the same tiles.
-@exact_kernel
-def _count(lo, hi, order, features, across, down, counts):
-    flat = features.reshape(-1)
-    for k in range(lo, hi):
-        prefetch(flat, int64(order[min(k + AHEAD, hi - 1)]) * FEATURES)
-        f = features[order[k]]
-        y0, y1 = _tile_rows(f, down)
-        for y in range(y0, y1):
-            x0, x1 = _tile_columns(f, y, across)
-            for x in range(x0, x1):
-                counts[y * across + x] += 1
+            rows[place] = i
+            keys[place] = feature_bits[i, DEPTH]
+            place += 1
 
 
 @exact_kernel
-def _scatter(lo, hi, order, features, across, down, places, entries):
-    flat = features.reshape(-1)
+def _count_digits(lo, hi, keys, lowest, shift, counts):
+    last = len(counts) - 1
+    for i in range(lo, hi):
+        counts[((keys[i] - lowest) >> shift) & last] += 1
+
+
+@exact_kernel
+def _scatter_digits(lo, hi, keys, rows, lowest, shift, places, keys_out, rows_out):
+    last = len(places) - 1
+    for i in range(lo, hi):
+        digit = ((keys[i] - lowest) >> shift) & last
+        place = places[digit]
+        places[digit] = place + 1
+        keys_out[place] = keys[i]
+        rows_out[place] = rows[i]
+
+
+@inline_kernel
+def cover_mask(flat, o, left, top, cell):
+    """Which of the 8×8 cells of `cell` px, from pixel (left, top) on, have a pixel centre in the bound of row o.
+
+    Bit 8 r + c stands for column c of row r. Lane r of the vectors is row r. Rounding may add a cell, never lose one.
+    """
+    half_height, xx = load1(flat, o + HALF_HEIGHT), load1(flat, o + WHITEN_XX)
+    xy, yy = load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+    radius, inverse = half_height * yy, ONE / xx
+    first_centre = fma16(ramp16(), cell, top + HALF - load1(flat, o + BOUND_Y))
+    low = max16(first_centre, -half_height)
+    high = min16(first_centre + (cell - ONE), half_height)
+    # the bound reaches furthest right at dy = tip and furthest left at dy = −tip
+    slope = float(xy) / float(yy)
+    tip = float32(-slope * float(radius) / (float(yy) * math.sqrt(1.0 + slope * slope)))
+    right, left_dy = min16(max16(splat16(tip), low), high), min16(max16(splat16(-tip), low), high)
+    down_right, down_left = right * yy, left_dy * yy
+    reach_right = sqrt16(max16(radius * radius - down_right * down_right, ZERO)) - right * xy + SLACK * radius
+    reach_left = sqrt16(max16(radius * radius - down_left * down_left, ZERO)) + left_dy * xy + SLACK * radius
+    middle, per_cell = load1(flat, o + BOUND_X) - left, ONE / cell
+    # pixel centres lie at +½: the first pixel right of v is −⌊½ − v⌋, the last one left of it ⌊v − ½⌋
+    first_pixel = ZERO - floor16(HALF + SLACK_PX - (middle - reach_left * inverse))
+    last_pixel = floor16(middle + reach_right * inverse - (HALF - SLACK_PX))
+    first = floor16(max16(min16(first_pixel * per_cell, EIGHT), ZERO))
+    end = floor16(max16(min16(last_pixel * per_cell, EIGHT - ONE), -ONE)) + ONE
+    return spans_to_bits(first, where_greater(low, high + SLACK_PX, ZERO, end))
+
+
+@exact_kernel
+def _deal(lo, hi, order, features, rects, slots, places, entries, per_row, next_record, records):
+    """Count the entries of each slot in `places`, or, when there is room for them, write them there."""
+    flat, width = features.reshape(-1), features.shape[1]
+    flat_rects = rects.reshape(-1)
     for k in range(lo, hi):
-        prefetch(flat, int64(order[min(k + AHEAD, hi - 1)]) * FEATURES)
-        f = features[order[k]]
-        y0, y1 = _tile_rows(f, down)
-        for y in range(y0, y1):
-            x0, x1 = _tile_columns(f, y, across)
-            for x in range(x0, x1):
-                t = y * across + x
-                entries[places[t]] = order[k]
-                places[t] += 1
+        g = order[k]
+        prefetch(flat_rects, int64(order[min(k + 2 * AHEAD, hi - 1)]) * 4)
+        ahead = int64(order[min(k + AHEAD, hi - 1)])
+        if rects[ahead, 2] - rects[ahead, 0] > 1 and rects[ahead, 3] - rects[ahead, 1] > 1:
+            prefetch(flat, ahead * width)
+        n = next_record[g] if len(records) else 0
+        x0, y0, x1, y1 = rects[g, 0], rects[g, 1], rects[g, 2], rects[g, 3]
+        # of one row or column of tiles the bound reaches every one
+        exact = x1 - x0 > 1 and y1 - y0 > 1
+        for top in range(y0, y1, CELLS):
+            for left in range(x0, x1, CELLS):
+                columns, rows = min(x1 - left, CELLS), min(y1 - top, CELLS)
+                mask = ((uint64(1) << uint64(columns)) - uint64(1)) * (FIRST_COLUMN >> uint64(64 - 8 * rows))
+                if exact:
+                    mask &= cover_mask(flat, int64(g) * width, float32(left * TILE), float32(top * TILE), CELL)
+                while mask:
+                    bit = lowest_bit(mask)
+                    mask &= mask - uint64(1)
+                    slot = slots[top + (bit >> 3), left + (bit & 7)]
+                    if slot >= 0:
+                        place = places[slot]
+                        places[slot] = place + 1
+                        if len(entries):
+                            entries[place] = g
+                        if len(records):
+                            records[place] = n
+                        n += 1
+        if len(per_row) and not len(entries):
+            per_row[g] = n

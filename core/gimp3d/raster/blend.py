@@ -1,244 +1,478 @@
-"""Front-to-back alpha blending of a tile's ellipses (paper eq. 2); one tile row is one 16-lane vector."""
+"""Front-to-back alpha blending of a tile's Gaussians (paper eq. 2), a block of 4×4 pixels at a time.
+
+A tile is 8×8 blocks, a block is one 16-lane vector, and a 64-bit mask says which blocks a Gaussian can reach. While a
+tile is blended its state lies in one scratch array: for each block PLANES vectors. Every CHECK list entries, pixels
+through which less than `stop` of the light passes are closed; blocks and tiles without open pixels are done.
+"""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import float32, int32
+from numba import boolean, float32, int64, uint64
 
-from ..jit import inline_kernel, kernel
+from ..jit import exact_kernel, inline_kernel
+from .bin import ONE, cover_mask
 from .project import (
+    A_X,
+    A_Y,
     BLUE,
+    BOUND_X,
+    BOUND_Y,
+    CENTRE_X,
+    CENTRE_Y,
     DEPTH,
-    FEATURES,
     GREEN,
     HALF,
-    HALF_HEIGHT,
+    HALF_LOG2E,
     LOG2_OPACITY,
-    MEAN_X,
-    MEAN_Y,
     NORMAL_X,
     NORMAL_Y,
     NORMAL_Z,
     RED,
     TILE,
+    U_X,
+    U_Y,
+    V_X,
+    V_Y,
     WHITEN_XX,
     WHITEN_XY,
     WHITEN_YY,
     ZERO,
 )
 from .vec16 import (
+    any_between,
+    columns16,
     exp2_16,
+    fma16,
     highest16,
     load1,
     load16,
+    lowest_bit,
     max16,
+    min16,
     prefetch,
-    ramp16,
+    rows16,
     splat16,
+    sqrt16,
     store16,
     sum16,
+    where_equal,
     where_greater,
 )
 
-CHECK = 16  # Gaussians between two looks at the tile's transmittance
-AHEAD = 4  # feature rows to prefetch
-ONE = np.float32(1)
+BLOCK = 4  # px, side of a block
+BLOCKS = 64  # in a tile
+CHECK = 16  # list entries between two looks at the transmittance; 0.99^16 of 1e-4 is still a normal float32
 NOTHING = np.float32(1e-6)  # weights and lengths below it are rounding
+HORIZON = np.float32(1e-6)  # 1 + A·δ of a surfel met a million times further away than its centre
+NEVER = np.float32(1e30)  # a squared length that no exponential survives
+BLOCK_PX, LAST_PX = np.float32(BLOCK), np.float32(BLOCK - 1)
 
-# A tile's scratch: for each of its rows these planes of 16 lanes.
-T, R, G, B, Z, MEDIAN, NX, NY, NZ = range(0, 9 * TILE, TILE)  # T: transmittance; the others are weighted sums
-ROW = 9 * TILE
-
-
-@inline_kernel
-def _pixel_rows(flat, o, top):
-    """Rows y0 … y1−1 of the tile at `top` whose pixel centres lie within the ellipse's height."""
-    mean_y, half_height = load1(flat, o + MEAN_Y), load1(flat, o + HALF_HEIGHT)
-    y0 = int32(max(mean_y - half_height + HALF - float32(top), ZERO))
-    y1 = int32(min(max(mean_y + half_height + HALF - float32(top), ZERO), float32(TILE)))
-    return y0, y1
-
-
-@inline_kernel
-def _alpha(along, shear, squash, log2_opacity, dy, alpha_min, alpha_max, zero, most):
-    """opacity · 2^−(squared whitened length) in a row dy below the mean, thresholded and capped."""
-    across = along + shear * dy
-    down = squash * dy
-    alpha = exp2_16((log2_opacity - down * down) - across * across)
-    alpha = where_greater(alpha, alpha_max, most, alpha)
-    return where_greater(alpha, alpha_min, alpha, zero)
+# Planes of a block's state. T is the transmittance of open pixels and 0 for closed ones, whose transmittance is kept
+# in HELD with the number of list entries after which they closed in CLOSED. MEDIAN is 1 + the list entry that took T
+# below one half. The others are sums over the Gaussians, weighted with their share in the pixel.
+T, HELD, CLOSED, MEDIAN, R, G, B, Z, NX, NY, NZ, M1, M2 = range(0, 13 * 16, 16)
+PLANES = 13
+BLOCK_STATE = PLANES * 16
+TILE_STATE = BLOCKS * BLOCK_STATE
+COUNTED, WEIGHT_STATE = 48, 64  # weigh_range's state: T, HELD, CLOSED and this plane
 
 
 @inline_kernel
-def _opaque(scratch, stride, stop):
-    """Whether less than `stop` of the light passes every pixel of the tile."""
-    clear = load16(scratch, 0)
-    for y in range(1, TILE):
-        clear = max16(clear, load16(scratch, y * stride))
-    return highest16(clear) < stop
+def aligned_empty(size):
+    """`size` float32 that begin with a cache line: vectors astride two lines cost twice."""
+    room = np.empty(size + 16, np.float32)
+    skip = (-(room.ctypes.data // 4)) % 16
+    return room[skip : skip + size]
 
 
-@kernel
+@inline_kernel
+def ellipse_alpha(along, down, log2_opacity, alpha_min, alpha_max):
+    """(alpha before it is capped, alpha) of a 3D Gaussian at whitened offsets."""
+    free = exp2_16(log2_opacity - fma16(along, along, down * down))
+    return free, where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
+
+
+@inline_kernel
+def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max):
+    """(alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass decides as 1 or 0) of a surfel.
+
+    u, v and den are U·δ, V·δ and 1 + A·δ (Huang 2024, eq. 8–11).
+    """
+    inverse = where_greater(den, HORIZON, ONE / den, ZERO)  # no hit behind the camera
+    near_plane = depth / near  # den beyond which the surfel lies before the near plane
+    squared = fma16(u, u, v * v) * inverse * inverse
+    squared = where_greater(den, HORIZON, where_greater(den, near_plane, NEVER, squared), NEVER)
+    low_pass = fma16(dx, dx, dy * dy) * disc
+    free = exp2_16(log2_opacity - min16(low_pass, squared))
+    alpha = where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
+    return free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
+
+
+@inline_kernel
+def open_blocks(pixels, left, top, width, height):
+    """A mask of the tile's blocks that have a wanted pixel."""
+    mask = uint64(0)
+    for v in range(top, min(top + TILE, height)):
+        for u in range(left, min(left + TILE, width)):
+            if pixels[v, u]:
+                mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
+    return mask
+
+
+@inline_kernel
+def picture_blocks(left, top, width, height):
+    """A mask of the tile's blocks that have a pixel of the picture."""
+    columns, rows = min((width - left + BLOCK - 1) // BLOCK, 8), min((height - top + BLOCK - 1) // BLOCK, 8)
+    first_column = uint64(0x0101010101010101) >> uint64(64 - 8 * rows)
+    return ((uint64(1) << uint64(columns)) - uint64(1)) * first_column
+
+
+@inline_kernel
+def _cover(entries, i, stop, end, flat, row_size, left, top, covers):
+    """The masks of entries i … stop−1. All at once, because each takes long to come out, and the loop over a mask's
+    bits cannot be predicted: asked for one by one, every mask would be waited for."""
+    for k in range(stop - i):
+        prefetch(flat, int64(entries[min(i + k + CHECK, end - 1)]) * row_size)
+        covers[k] = cover_mask(flat, int64(entries[i + k]) * row_size, float32(left), float32(top), BLOCK_PX)
+
+
+@inline_kernel
+def _close(state, size, mask, entry, stop):
+    """Close pixels that less than `stop` of the light passes; the blocks of `mask` that still have open ones, and
+    those in which some were closed."""
+    still, closing = uint64(0), uint64(0)
+    while mask:
+        b = lowest_bit(mask)
+        bit = mask & (~mask + uint64(1))
+        mask ^= bit
+        k = b * size
+        t = load16(state, k + T)
+        if any_between(t, ZERO, stop):
+            closing |= bit
+            closes = where_greater(t, ZERO, where_greater(stop, t, splat16(ONE), ZERO), ZERO)
+            store16(state, k + HELD, where_greater(closes, ZERO, t, load16(state, k + HELD)))
+            store16(state, k + CLOSED, where_greater(closes, ZERO, splat16(entry), load16(state, k + CLOSED)))
+            t = where_greater(closes, ZERO, ZERO, t)
+            store16(state, k + T, t)
+            if highest16(t) > ZERO:
+                still |= bit
+        else:
+            still |= bit
+    return still, closing
+
+
+@exact_kernel
 def blend_range(
     lo,
     hi,
-    tile_ids,  # [T] the order in which tiles are done
+    order,  # [S] slots in the order in which they are done
+    tiles,  # [S]
     across,
     width,
     height,
-    starts,  # [T+1]
+    starts,  # [S+1]
     entries,  # [P]
-    features,  # [N, 16]
-    alpha_min,
-    alpha_max,
-    stop,
+    features,  # [N, 16 or 32]
+    surfels,  # features are of surfels
+    limits,  # [6] float32: alpha_min, alpha_max, stop, near, low-pass factor of surfels, distortion's near
+    shifts,  # [S] float32: what is taken from the distortion's disparities, against cancellation
+    flags,  # [5] bool: with rgb, expected depth, median depth, normals, distortion
+    wanted,  # [S] uint64: blocks to draw
+    front,  # [S, TILE_STATE] what lies before the entries, or empty
+    masks,  # [P] uint64 out: blocks that each entry was blended into, or empty
+    closings,  # [P/CHECK + S + 1] uint64 out: blocks with closing pixels at each check, or empty
+    ends,  # [S] int64 out: one past the last entry that was looked at
+    states,  # [S, TILE_STATE] out; [0, …] if the caller needs only the pictures
     background,  # [3]
-    with_rgb,
-    with_depth,
-    with_normals,
-    rgb,  # [H, W, 3] out; the outputs that are not asked for are empty
-    alpha_out,  # [H, W] out
-    expected,  # [H, W] out
-    median,  # [H, W] out
-    normals,  # [H, W, 3] out
+    back,  # [S, TILE_STATE] what lies behind the entries, or empty
+    pictures,  # (rgb [H, W, 3], alpha, expected, median [H, W], normals [H, W, 3], distortion [H, W]) out
 ):
-    """Blend the tiles tile_ids[lo:hi]."""
-    flat = features.reshape(-1)
-    scratch = np.empty(TILE * ROW, np.float32)
-    zero, one, most = splat16(ZERO), splat16(ONE), splat16(alpha_max)
+    """Blend the tiles of slots order[lo:hi]."""
+    alpha_min, alpha_max, stop = limits[0], limits[1], limits[2]
+    near, disc, distortion_near = limits[3], limits[4], limits[5]
+    with_rgb, with_depth, with_median, with_normals, with_distortion = flags[0], flags[1], flags[2], flags[3], flags[4]
+    flat, row_size = features.reshape(-1), int64(features.shape[1])
+    column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
+    own_state, covers = aligned_empty(TILE_STATE), np.empty(CHECK, np.uint64)
     for j in range(lo, hi):
-        t = tile_ids[j]
-        left, top = (t % across) * TILE, (t // across) * TILE
-        for k in range(0, TILE * ROW, TILE):
-            store16(scratch, k, zero)
-        for k in range(T, TILE * ROW, ROW):
-            store16(scratch, k, one)
-        x = ramp16(float32(left) + HALF)
-        first, end = starts[t], starts[t + 1]
-        for i in range(first, end):
-            o = np.int64(entries[i]) * FEATURES
-            prefetch(flat, np.int64(entries[min(i + AHEAD, end - 1)]) * FEATURES)
-            y0, y1 = _pixel_rows(flat, o, top)
-            along = (x - load1(flat, o + MEAN_X)) * load1(flat, o + WHITEN_XX)
-            shear, squash = load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
-            log2_opacity, z = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
+        slot = order[j]
+        left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
+        state = states[slot] if len(states) else own_state
+        if len(front):
+            state[:] = front[slot]
+        else:
+            for b in range(BLOCKS):
+                for plane in range(PLANES):
+                    store16(state, b * BLOCK_STATE + 16 * plane, none)
+                store16(state, b * BLOCK_STATE + T, one)
+        alive, shift = wanted[slot], shifts[slot]
+        if len(front):
+            alive, closing = _close(state, BLOCK_STATE, alive, ZERO, stop)
+        first, end, i = starts[slot], starts[slot + 1], starts[slot]
+        while i < end and alive:
+            o = int64(entries[i]) * row_size
+            if (i - first) % CHECK == 0:
+                _cover(entries, i, min(i + CHECK, end), end, flat, row_size, left, top, covers)
+            mask = alive & covers[(i - first) % CHECK]
+            if len(masks):
+                masks[i] = mask
+            number = splat16(float32(i - first + 1))
+            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
             red, green, blue = load1(flat, o + RED), load1(flat, o + GREEN), load1(flat, o + BLUE)
             nx, ny, nz = load1(flat, o + NORMAL_X), load1(flat, o + NORMAL_Y), load1(flat, o + NORMAL_Z)
-            depth = splat16(z)
-            dy = float32(top + y0) + HALF - load1(flat, o + MEAN_Y)
-            for y in range(y0, y1):
-                k = y * ROW
-                alpha = _alpha(along, shear, squash, log2_opacity, dy, alpha_min, alpha_max, zero, most)
-                dy = dy + ONE
-                before = load16(scratch, k + T)
-                weight = alpha * before
-                after = before - weight
-                store16(scratch, k + T, after)
-                if with_rgb:
-                    store16(scratch, k + R, load16(scratch, k + R) + weight * red)
-                    store16(scratch, k + G, load16(scratch, k + G) + weight * green)
-                    store16(scratch, k + B, load16(scratch, k + B) + weight * blue)
-                if with_depth:
-                    store16(scratch, k + Z, load16(scratch, k + Z) + weight * z)
-                    so_far = load16(scratch, k + MEDIAN)
-                    passed = where_greater(after, HALF, so_far, depth)
-                    store16(scratch, k + MEDIAN, where_greater(before, HALF, passed, so_far))
-                if with_normals:
-                    store16(scratch, k + NX, load16(scratch, k + NX) + weight * nx)
-                    store16(scratch, k + NY, load16(scratch, k + NY) + weight * ny)
-                    store16(scratch, k + NZ, load16(scratch, k + NZ) + weight * nz)
-            if (i - first) % CHECK == CHECK - 1 and _opaque(scratch, ROW, stop):
-                break
-        for y in range(min(TILE, height - top)):
-            for lane in range(min(TILE, width - left)):
-                k, v, u = y * ROW + lane, top + y, left + lane
-                clear = load1(scratch, k + T)
-                weight_sum = ONE - clear
-                alpha_out[v, u] = weight_sum
-                if with_rgb:
-                    for c in range(3):
-                        rgb[v, u, c] = load1(scratch, k + R + c * TILE) + clear * background[c]
-                if with_depth:
-                    there = weight_sum > NOTHING
-                    expected[v, u] = load1(scratch, k + Z) / weight_sum if there else ZERO
-                    median[v, u] = load1(scratch, k + MEDIAN)
-                if with_normals:
-                    nx, ny, nz = load1(scratch, k + NX), load1(scratch, k + NY), load1(scratch, k + NZ)
-                    length = math.sqrt(nx * nx + ny * ny + nz * nz)
-                    inverse = ONE / length if length > NOTHING else ZERO
-                    normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = (
-                        nx * inverse,
-                        ny * inverse,
-                        nz * inverse,
+            if surfels:
+                x, y = float32(left) + HALF - load1(flat, o + CENTRE_X), float32(top) + HALF - load1(flat, o + CENTRE_Y)
+                u_x, u_y = load1(flat, o + U_X), load1(flat, o + U_Y)
+                v_x, v_y = load1(flat, o + V_X), load1(flat, o + V_Y)
+                a_x, a_y = load1(flat, o + A_X), load1(flat, o + A_Y)
+                disparity = distortion_near / depth
+                while mask:
+                    b = lowest_bit(mask)
+                    mask &= mask - uint64(1)
+                    k = b * BLOCK_STATE
+                    dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
+                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
+                    den = fma16(dx, a_x, fma16(dy, a_y, one))
+                    _, alpha, inverse, blurred = surfel_alpha(
+                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
                     )
+                    before = load16(state, k + T)
+                    weight = alpha * before
+                    after = before - weight
+                    store16(state, k + T, after)
+                    if with_rgb:
+                        _add_colour(state, k, weight, red, green, blue)
+                    if with_depth:
+                        z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
+                        store16(state, k + Z, fma16(weight, z, load16(state, k + Z)))
+                    if with_median:
+                        _mark_median(state, k, before, after, number)
+                    if with_normals:
+                        _add_normal(state, k, weight, nx, ny, nz)
+                    if with_distortion:
+                        m = where_greater(blurred, ZERO, one, den) * disparity - shift
+                        _add_disparity(state, k, weight, m)
+            else:
+                x, y = float32(left) + HALF - load1(flat, o + BOUND_X), float32(top) + HALF - load1(flat, o + BOUND_Y)
+                xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+                along0, down0 = fma16(column, xx, row * xy), row * yy
+                m = splat16(distortion_near / depth - shift)
+                while mask:
+                    b = lowest_bit(mask)
+                    mask &= mask - uint64(1)
+                    k = b * BLOCK_STATE
+                    dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
+                    _, alpha = ellipse_alpha(
+                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
+                    )
+                    before = load16(state, k + T)
+                    weight = alpha * before
+                    after = before - weight
+                    store16(state, k + T, after)
+                    if with_rgb:
+                        _add_colour(state, k, weight, red, green, blue)
+                    if with_depth:
+                        store16(state, k + Z, fma16(weight, depth, load16(state, k + Z)))
+                    if with_median:
+                        _mark_median(state, k, before, after, number)
+                    if with_normals:
+                        _add_normal(state, k, weight, nx, ny, nz)
+                    if with_distortion:
+                        _add_disparity(state, k, weight, m)
+            i += 1
+            if (i - first) % CHECK == 0:
+                alive, closing = _close(state, BLOCK_STATE, alive, float32(i - first), stop)
+                if len(closings):
+                    closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
+        ends[slot] = i
+        _finish(state, left, top, width, height, wanted[slot], first, entries, features, surfels, limits, flags,
+                background, back, slot, pictures)  # fmt: skip
 
 
-@kernel
+@inline_kernel
+def _add_colour(state, k, weight, red, green, blue):
+    store16(state, k + R, fma16(weight, red, load16(state, k + R)))
+    store16(state, k + G, fma16(weight, green, load16(state, k + G)))
+    store16(state, k + B, fma16(weight, blue, load16(state, k + B)))
+
+
+@inline_kernel
+def _mark_median(state, k, before, after, number):
+    crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
+    store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
+
+
+@inline_kernel
+def _add_normal(state, k, weight, nx, ny, nz):
+    store16(state, k + NX, fma16(weight, nx, load16(state, k + NX)))
+    store16(state, k + NY, fma16(weight, ny, load16(state, k + NY)))
+    store16(state, k + NZ, fma16(weight, nz, load16(state, k + NZ)))
+
+
+@inline_kernel
+def _add_disparity(state, k, weight, m):
+    moment = weight * m
+    store16(state, k + M1, load16(state, k + M1) + moment)
+    store16(state, k + M2, fma16(moment, m, load16(state, k + M2)))
+
+
+@inline_kernel
+def total(state, back, slot, k, plane, clear):
+    """A weighted sum of the whole ray: what the state holds, and what shines through it from the layer behind."""
+    own = load16(state, k + plane)
+    return fma16(clear, load16(back[slot], k + plane), own) if len(back) else own
+
+
+@inline_kernel
+def _finish(
+    state, left, top, width, height, wanted, first, entries, features, surfels, limits, flags, background, back, slot,
+    pictures,
+):  # fmt: skip
+    """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
+    rgb, alpha, expected, median, normals, distortion = pictures
+    out = np.empty(9 * 16, np.float32)
+    mask = wanted
+    while mask:
+        b = lowest_bit(mask)
+        mask &= mask - uint64(1)
+        k = b * BLOCK_STATE
+        clear = load16(state, k + T) + load16(state, k + HELD)
+        passing = clear
+        if len(back):
+            passing = clear * (load16(back[slot], k + T) + load16(back[slot], k + HELD))
+        weight = ONE - passing
+        store16(out, 0, weight)
+        if flags[0]:
+            for c in range(3):
+                store16(out, 16 + 16 * c, fma16(passing, background[c], total(state, back, slot, k, R + 16 * c, clear)))
+        if flags[1]:
+            z = total(state, back, slot, k, Z, clear)
+            store16(out, 64, where_greater(weight, NOTHING, z / max16(weight, NOTHING), ZERO))
+        if flags[3]:
+            nx, ny, nz = (
+                total(state, back, slot, k, NX, clear),
+                total(state, back, slot, k, NY, clear),
+                total(state, back, slot, k, NZ, clear),
+            )
+            length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
+            inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
+            store16(out, 80, nx * inverse)
+            store16(out, 96, ny * inverse)
+            store16(out, 112, nz * inverse)
+        if flags[4]:
+            m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
+            store16(out, 128, max16(weight * m2 - m1 * m1, ZERO))
+        u0, v0 = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
+        for y in range(min(BLOCK, height - v0)):
+            for x in range(min(BLOCK, width - u0)):
+                lane, u, v = 4 * y + x, u0 + x, v0 + y
+                alpha[v, u] = load1(out, lane)
+                if flags[0]:
+                    for c in range(3):
+                        rgb[v, u, c] = load1(out, 16 + 16 * c + lane)
+                if flags[1]:
+                    expected[v, u] = load1(out, 64 + lane)
+                if flags[2]:
+                    number = load1(state, k + MEDIAN + lane)
+                    median[v, u] = -number  # a layer in front keeps the depth itself, with a minus
+                    if number > ZERO:
+                        median[v, u] = depth_at(features[entries[first + int64(number) - 1]], u, v, surfels, limits)
+                if flags[3]:
+                    for c in range(3):
+                        normals[v, u, c] = load1(out, 80 + 16 * c + lane)
+                if flags[4]:
+                    distortion[v, u] = load1(out, 128 + lane)
+
+
+@inline_kernel
+def depth_at(f, u, v, surfels, limits):
+    """z at pixel (u, v) of the Gaussian with feature row f."""
+    depth = f[DEPTH]
+    if surfels:
+        dx, dy = float32(u) + HALF - f[CENTRE_X], float32(v) + HALF - f[CENTRE_Y]
+        along_u, along_v = f[U_X] * dx + f[U_Y] * dy, f[V_X] * dx + f[V_Y] * dy
+        den = ONE + f[A_X] * dx + f[A_Y] * dy
+        squared = (along_u * along_u + along_v * along_v) / (den * den)
+        if den > HORIZON and depth >= limits[3] * den and squared <= (dx * dx + dy * dy) * limits[4]:
+            depth = depth / den
+    return depth
+
+
+@exact_kernel
 def weigh_range(
     lo,
     hi,
-    tile_ids,
+    order,
+    tiles,
     across,
     width,
     height,
     starts,
     entries,
     features,
-    alpha_min,
-    alpha_max,
-    stop,
+    surfels,
+    limits,
     pixels,  # [H, W] bool, True where weights count
     sums,  # [P] out: Σ of the blend weights of each list entry; zero on entry
     peaks,  # [P] out: their maximum
 ):
-    """Blend weights per (tile, Gaussian), each in its own slot: no atomics, the same for any thread count."""
-    flat = features.reshape(-1)
-    transmittance = np.empty(TILE * TILE, np.float32)
-    counted = np.empty(TILE * TILE, np.float32)
-    zero, one, most = splat16(ZERO), splat16(ONE), splat16(alpha_max)
+    """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count."""
+    alpha_min, alpha_max, stop, near, disc = limits[0], limits[1], limits[2], limits[3], limits[4]
+    flat, row_size = features.reshape(-1), int64(features.shape[1])
+    column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
+    state, covers = aligned_empty(BLOCKS * WEIGHT_STATE), np.empty(CHECK, np.uint64)
     for j in range(lo, hi):
-        t = tile_ids[j]
-        left, top = (t % across) * TILE, (t // across) * TILE
-        if not pixels[top : top + TILE, left : left + TILE].any():
-            continue
-        counted[:] = ZERO
-        for y in range(min(TILE, height - top)):
-            for lane in range(min(TILE, width - left)):
-                counted[y * TILE + lane] = ONE if pixels[top + y, left + lane] else ZERO
-        for k in range(0, TILE * TILE, TILE):
-            store16(transmittance, k, one)
-        x = ramp16(float32(left) + HALF)
-        first, end = starts[t], starts[t + 1]
-        for i in range(first, end):
-            o = np.int64(entries[i]) * FEATURES
-            prefetch(flat, np.int64(entries[min(i + AHEAD, end - 1)]) * FEATURES)
-            y0, y1 = _pixel_rows(flat, o, top)
-            along = (x - load1(flat, o + MEAN_X)) * load1(flat, o + WHITEN_XX)
-            shear, squash = load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
-            log2_opacity = load1(flat, o + LOG2_OPACITY)
-            dy = float32(top + y0) + HALF - load1(flat, o + MEAN_Y)
-            total, peak = zero, zero
-            for y in range(y0, y1):
-                k = y * TILE
-                alpha = _alpha(along, shear, squash, log2_opacity, dy, alpha_min, alpha_max, zero, most)
-                dy = dy + ONE
-                before = load16(transmittance, k)
+        slot = order[j]
+        left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
+        for b in range(BLOCKS):
+            k = b * WEIGHT_STATE
+            store16(state, k + T, one)
+            store16(state, k + COUNTED, none)
+            for y in range(min(BLOCK, height - top - BLOCK * (b >> 3))):
+                for x in range(min(BLOCK, width - left - BLOCK * (b & 7))):
+                    if pixels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x]:
+                        state[k + COUNTED + 4 * y + x] = ONE
+        alive = open_blocks(pixels, left, top, width, height)
+        first, end, i = starts[slot], starts[slot + 1], starts[slot]
+        while i < end and alive:
+            o = int64(entries[i]) * row_size
+            if (i - first) % CHECK == 0:
+                _cover(entries, i, min(i + CHECK, end), end, flat, row_size, left, top, covers)
+            mask = alive & covers[(i - first) % CHECK]
+            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
+            weight_sum, peak = none, none
+            while mask:
+                b = lowest_bit(mask)
+                mask &= mask - uint64(1)
+                k = b * WEIGHT_STATE
+                x, y = float32(left) + HALF + BLOCK_PX * float32(b & 7), float32(top) + HALF + BLOCK_PX * float32(b >> 3)
+                if surfels:
+                    dx, dy = column + (x - load1(flat, o + CENTRE_X)), row + (y - load1(flat, o + CENTRE_Y))
+                    u = fma16(dx, load1(flat, o + U_X), dy * load1(flat, o + U_Y))
+                    v = fma16(dx, load1(flat, o + V_X), dy * load1(flat, o + V_Y))
+                    den = fma16(dx, load1(flat, o + A_X), fma16(dy, load1(flat, o + A_Y), one))
+                    _, alpha, _, _ = surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max)
+                else:
+                    dx, dy = column + (x - load1(flat, o + BOUND_X)), row + (y - load1(flat, o + BOUND_Y))
+                    along = fma16(dx, load1(flat, o + WHITEN_XX), dy * load1(flat, o + WHITEN_XY))
+                    _, alpha = ellipse_alpha(along, dy * load1(flat, o + WHITEN_YY), log2_opacity, alpha_min, alpha_max)
+                before = load16(state, k + T)
                 weight = alpha * before
-                store16(transmittance, k, before - weight)
-                weight = weight * load16(counted, k)
-                total = total + weight
+                store16(state, k + T, before - weight)
+                weight = weight * load16(state, k + COUNTED)
+                weight_sum = weight_sum + weight
                 peak = max16(peak, weight)
-            sums[i], peaks[i] = sum16(total), highest16(peak)
-            if (i - first) % CHECK == CHECK - 1 and _opaque(transmittance, TILE, stop):
-                break
+            sums[i], peaks[i] = sum16(weight_sum), highest16(peak)
+            i += 1
+            if (i - first) % CHECK == 0:
+                alive, _ = _close(state, WEIGHT_STATE, alive, float32(i - first), stop)
 
 
-@kernel
-def gather_weights(entries, sums, peaks, total, peak):
+@exact_kernel
+def gather_weights(entries, sums, peaks, total_weight, peak):
     """Add each entry's weights to its Gaussian, in list order."""
     for i in range(len(entries)):
         m = entries[i]
-        total[m] += sums[i]
+        total_weight[m] += sums[i]
         peak[m] = max(peak[m], peaks[i])

@@ -1,8 +1,9 @@
-"""From Gaussians to ellipses in the image: EWA projection (Zwicker 2001, Kerbl 2023) and SH colour.
+"""From Gaussians to ellipses in the image: EWA projection (Zwicker 2001, Kerbl 2023), ray–splat intersection
+for surfels (Huang 2024), SH colour.
 
-Geometry is computed in float64 and without fast-math: the rows come from files, so infinities and NaN must be
-seen as such, scenes may lie far from the origin, and a giant's covariance would overflow float32. What
-blending reads is float32.
+Geometry is computed in float64 and NaN-safe: the rows come from files, so infinities and NaN must be seen as such,
+scenes may lie far from the origin, and a giant's covariance would overflow float32. What blending reads is float32.
+Rows are staged CHUNK at a time into planes of one scratch array, because loops over such planes vectorise.
 """
 
 from __future__ import annotations
@@ -10,33 +11,48 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float64, int32
+from numba import float32, float64, int32, int64
 
 from ..jit import exact_kernel, inline_kernel
+from .vec16 import bits_of, float_of, load1, store1
 
-TILE = 16  # px, side of a tile
+TILE = 32  # px, side of a tile
 
-# One feature row of 16 float32 (a cache line) per Gaussian. The whitening matrix [[XX, XY], [0, YY]] maps an
-# offset in pixels so that alpha = opacity · 2^−(squared length): unlike a conic's, its terms are never
-# negative, so that rounding cannot make a needle glow.
-MEAN_X, MEAN_Y = 0, 1  # px
+# One feature row of float32 per Gaussian: 16 (a cache line), or 32 for surfels. Slots 0–5 bound where it can be seen:
+# the whitening matrix [[XX, XY], [0, YY]] maps an offset from (BOUND_X, BOUND_Y) in px so that the bound has the
+# length HALF_HEIGHT · YY. Unlike a conic's, its terms are never subtracted, so that rounding cannot make a needle glow.
+BOUND_X, BOUND_Y = 0, 1  # px
 WHITEN_XX, WHITEN_XY, WHITEN_YY = 2, 3, 4  # 1/px
-LOG2_OPACITY = 5
-RED, GREEN, BLUE = 6, 7, 8
-DEPTH = 9  # z
-HALF_HEIGHT = 10  # px, vertical reach of the ellipse alpha = alpha_min
+HALF_HEIGHT = 5  # px
+LOG2_OPACITY = 6
+DEPTH = 7  # z of the centre
+RED, GREEN, BLUE = 8, 9, 10
 NORMAL_X, NORMAL_Y, NORMAL_Z = 11, 12, 13  # camera axes, facing the camera
-FEATURES = 16
+# A 3D Gaussian: alpha = opacity · 2^−(squared whitened length); its centre is (BOUND_X, BOUND_Y).
+ELLIPSE_ROW = 16
+# A surfel: with δ the offset from its projected centre, its own coordinates at a pixel are u = (U·δ) / (1 + A·δ)
+# and v = (V·δ) / (1 + A·δ), the ray meets it at z = DEPTH / (1 + A·δ), and alpha = opacity · 2^−(u² + v²).
+CENTRE_X, CENTRE_Y, U_X, U_Y, V_X, V_Y, A_X, A_Y = range(14, 22)
+SURFEL_ROW = 32
 
 UNUSABLE, HIDDEN, DRAWN = -1, 0, 1  # what became of a row
 
 FAR = 1e30  # beyond it, depths in scene units or positions in pixels are no longer safe in float32
+EDGE_ON = 1e-6  # sine of the angle to its plane below which a surfel is seen by its low-pass only
+SHARP = 1e6  # 1/px: so steep that only the low-pass is left
 LARGEST_LOG_SCALE = 80.0  # as Gaussians.usable
 SMALLEST_SQUARED_QUAT = 1e-20
-HALF_LOG2E = 0.5 * math.log2(math.e)  # exp(−x²/2) = 2^(−HALF_LOG2E · x²)
+LOG2E, LN2 = math.log2(math.e), math.log(2.0)
+HALF_LOG2E = 0.5 * LOG2E  # exp(−x²/2) = 2^(−HALF_LOG2E · x²)
 EXPONENT_BITS = np.int32(0x7F800000)  # a float32 is finite if its magnitude bits lie below
 MAGNITUDE_BITS = np.int32(0x7FFFFFFF)
 ZERO, HALF = np.float32(0), np.float32(0.5)
+
+# float64 numbers as bits, for exp and log2 that vectorise (libm's calls do not)
+ROUNDING = 1.5 * 2.0**52  # added to a float64 it leaves the nearest integer in the low mantissa bits
+MANTISSA_BITS = np.int64(0xFFFFFFFFFFFFF)
+ONE_BITS = np.int64(0x3FF0000000000000)
+INTEGER_BITS, INTEGER_OFFSET = np.int64(0x4330000000000000), 2.0**52  # float_of(INTEGER_BITS | k) = 2^52 + k
 
 # Real spherical harmonics in 3DGS's order and signs.
 C0, C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
@@ -53,6 +69,54 @@ C3 = tuple(
 )
 TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
 
+# Scratch planes of a chunk: what is staged, then what comes out of it
+CHUNK = 64
+X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, LOGIT = range(0, 11 * CHUNK, CHUNK)  # camera coordinates of the centre
+(OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2, OUT_NX, OUT_NY, OUT_NZ,
+ OUT_CENTRE_X, OUT_CENTRE_Y, OUT_UX, OUT_UY, OUT_VX, OUT_VY, OUT_AX, OUT_AY) = range(11 * CHUNK, 30 * CHUNK, CHUNK)  # fmt: skip
+PLANES = 30
+SH_X, SH_Y, SH_Z = 16 * CHUNK, 17 * CHUNK, 18 * CHUNK  # after 16 planes of the SH basis: the direction
+BASIS_PLANES = 19
+
+
+@inline_kernel
+def exp64(x):
+    """e^x with a relative error of 1e-11 for |x| ≤ 700; it is clamped beyond."""
+    x = min(max(x, -700.0), 700.0)
+    shifted = x * LOG2E + ROUNDING
+    r = x - (shifted - ROUNDING) * LN2
+    p = 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    return float_of(bits_of(p) + (bits_of(shifted) << int64(52)))
+
+
+@inline_kernel
+def log2_64(y):
+    """log₂ y of a normal number with an absolute error of 1e-11."""
+    bits = bits_of(y)
+    # the exponent is counted from √½, so that the mantissa lies in [√½, √2)
+    lifted = bits - np.int64(0x3FE6A09E667F3BCD)
+    exponent = float_of(INTEGER_BITS | ((lifted >> int64(52)) + int64(2048))) - (INTEGER_OFFSET + 2048.0)
+    m = float_of((lifted & MANTISSA_BITS) + np.int64(0x3FE6A09E667F3BCD))
+    s = (m - 1.0) / (m + 1.0)
+    ss = s * s
+    p = 1.0 / 13.0
+    p = p * ss + 1.0 / 11.0
+    p = p * ss + 1.0 / 9.0
+    p = p * ss + 1.0 / 7.0
+    p = p * ss + 1.0 / 5.0
+    p = p * ss + 1.0 / 3.0
+    p = p * ss + 1.0
+    return exponent + 2.0 * LOG2E * s * p
+
 
 @inline_kernel
 def _finite_bits(bits, i):
@@ -64,8 +128,8 @@ def _finite_bits(bits, i):
 
 
 @inline_kernel
-def _usable(i, means, log_scales, quats, opacity_logits, sh_bits):
-    """`Gaussians.usable` of one row, so that drawing needs no pass over all SH coefficients in NumPy."""
+def _usable(i, means, log_scales, quats, opacity_logits):
+    """`Gaussians.usable` of one row, but for its SH coefficients."""
     ok = not math.isnan(opacity_logits[i])
     for k in range(3):
         ok = ok and math.isfinite(means[i, k])
@@ -75,26 +139,219 @@ def _usable(i, means, log_scales, quats, opacity_logits, sh_bits):
     for k in range(4):
         ok = ok and math.isfinite(quats[i, k])
         squared += quats[i, k] * quats[i, k]
-    return ok and squared > SMALLEST_SQUARED_QUAT and _finite_bits(sh_bits, i)
+    return ok and squared > SMALLEST_SQUARED_QUAT
+
+
+@exact_kernel
+def sh_basis(s, n, camera, bands, basis):
+    """Real spherical harmonics of the directions from the camera to the first n staged centres: planes of `basis`."""
+    for k in range(n):
+        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+        x, y, z = x * inverse, y * inverse, z * inverse
+        store1(basis, SH_X + k, float32(camera[0] * x + camera[3] * y + camera[6] * z))
+        store1(basis, SH_Y + k, float32(camera[1] * x + camera[4] * y + camera[7] * z))
+        store1(basis, SH_Z + k, float32(camera[2] * x + camera[5] * y + camera[8] * z))
+        store1(basis, k, C0)
+    if bands > 1:
+        for k in range(n):
+            store1(basis, 1 * CHUNK + k, -C1 * load1(basis, SH_Y + k))
+            store1(basis, 2 * CHUNK + k, C1 * load1(basis, SH_Z + k))
+            store1(basis, 3 * CHUNK + k, -C1 * load1(basis, SH_X + k))
+    if bands > 4:
+        for k in range(n):
+            x, y, z = load1(basis, SH_X + k), load1(basis, SH_Y + k), load1(basis, SH_Z + k)
+            xx, yy, zz = x * x, y * y, z * z
+            store1(basis, 4 * CHUNK + k, C2[0] * x * y)
+            store1(basis, 5 * CHUNK + k, -C2[0] * y * z)
+            store1(basis, 6 * CHUNK + k, C2[1] * (TWO * zz - xx - yy))
+            store1(basis, 7 * CHUNK + k, -C2[0] * x * z)
+            store1(basis, 8 * CHUNK + k, C2[2] * (xx - yy))
+    if bands > 9:
+        for k in range(n):
+            x, y, z = load1(basis, SH_X + k), load1(basis, SH_Y + k), load1(basis, SH_Z + k)
+            xx, yy, zz = x * x, y * y, z * z
+            store1(basis, 9 * CHUNK + k, -C3[0] * y * (THREE * xx - yy))
+            store1(basis, 10 * CHUNK + k, C3[1] * x * y * z)
+            store1(basis, 11 * CHUNK + k, -C3[2] * y * (FOUR * zz - xx - yy))
+            store1(basis, 12 * CHUNK + k, C3[3] * z * (TWO * zz - THREE * (xx + yy)))
+            store1(basis, 13 * CHUNK + k, -C3[2] * x * (FOUR * zz - xx - yy))
+            store1(basis, 14 * CHUNK + k, C3[4] * z * (xx - yy))
+            store1(basis, 15 * CHUNK + k, -C3[0] * x * (xx - THREE * yy))
 
 
 @inline_kernel
-def _colour(sh, i, c, x, y, z):
-    """max(0, 0.5 + Σ Y_k h_k) of channel c in direction (x, y, z)."""
-    bands = sh.shape[1]
-    value = HALF + C0 * sh[i, 0, c]
-    if bands > 1:
-        value += C1 * (z * sh[i, 2, c] - y * sh[i, 1, c] - x * sh[i, 3, c])
-    if bands > 4:
-        xx, yy, zz = x * x, y * y, z * z
-        value += C2[0] * (x * y * sh[i, 4, c] - y * z * sh[i, 5, c] - x * z * sh[i, 7, c])
-        value += C2[1] * (TWO * zz - xx - yy) * sh[i, 6, c] + C2[2] * (xx - yy) * sh[i, 8, c]
-        if bands > 9:
-            value -= C3[0] * (y * (THREE * xx - yy) * sh[i, 9, c] + x * (xx - THREE * yy) * sh[i, 15, c])
-            value -= C3[2] * (FOUR * zz - xx - yy) * (y * sh[i, 11, c] + x * sh[i, 13, c])
-            value += C3[3] * z * (TWO * zz - THREE * (xx + yy)) * sh[i, 12, c]
-            value += C3[1] * x * y * z * sh[i, 10, c] + C3[4] * z * (xx - yy) * sh[i, 14, c]
-    return max(value, ZERO)
+def rotation(w, x, y, z):
+    """The rotation matrix of a quaternion of any length, row by row."""
+    k = 2.0 / (w * w + x * x + y * y + z * z)
+    return (
+        1.0 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y),
+        k * (x * y + w * z), 1.0 - k * (x * x + z * z), k * (y * z - w * x),
+        k * (x * z - w * y), k * (y * z + w * x), 1.0 - k * (x * x + y * y),
+    )  # fmt: skip
+
+
+@inline_kernel
+def _load_quat(s, k):
+    return load1(s, QW + k), load1(s, QX + k), load1(s, QY + k), load1(s, QZ + k)
+
+
+@exact_kernel
+def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
+    """The first n staged 3D Gaussians as ellipses in the image."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
+        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
+    )  # fmt: skip
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    left, right, top, bottom = camera[19], camera[20], camera[21], camera[22]
+    for k in range(n):
+        x, y, inverse_z = load1(s, X + k), load1(s, Y + k), 1.0 / load1(s, Z + k)
+        # Rows of J R: the Jacobian of the perspective times the rotation. Far outside the frustum it is
+        # evaluated at the bounds, or else a splat beside the camera would flood the view.
+        tan_x, tan_y = x * inverse_z, y * inverse_z
+        j00, j11 = fx * inverse_z, fy * inverse_z
+        j02, j12 = -j00 * min(max(tan_x, left), right), -j11 * min(max(tan_y, top), bottom)
+        a0, a1, a2 = j00 * r00 + j02 * r20, j00 * r01 + j02 * r21, j00 * r02 + j02 * r22
+        b0, b1, b2 = j11 * r10 + j12 * r20, j11 * r11 + j12 * r21, j11 * r12 + j12 * r22
+
+        qw, qx, qy, qz = _load_quat(s, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
+        s0, s1, s2 = exp64(load1(s, S0 + k)), exp64(load1(s, S1 + k)), exp64(load1(s, S2 + k))
+        # The image covariance [[uu, uv], [uv, vv]] from u, v = rows of J R Q S. Its determinant is |u × v|²,
+        # so that with the low-pass nothing is subtracted: uu·vv − uv² would cancel for needles.
+        u0, v0 = (a0 * q00 + a1 * q10 + a2 * q20) * s0, (b0 * q00 + b1 * q10 + b2 * q20) * s0
+        u1, v1 = (a0 * q01 + a1 * q11 + a2 * q21) * s1, (b0 * q01 + b1 * q11 + b2 * q21) * s1
+        u2, v2 = (a0 * q02 + a1 * q12 + a2 * q22) * s2, (b0 * q02 + b1 * q12 + b2 * q22) * s2
+        uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
+        n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+        sharp = n0 * n0 + n1 * n1 + n2 * n2
+        det = sharp + low_pass * (uu + vv) + low_pass * low_pass
+        xx, yy = uu + low_pass, vv + low_pass
+
+        log2_opacity = -log2_64(1.0 + exp64(-load1(s, LOGIT + k)))
+        if antialiased:  # mip-splatting: what the low-pass adds to the area is taken from the opacity
+            log2_opacity += 0.5 * log2_64(max(sharp / det, 1e-300))
+        squared_radius = log2_opacity - log2_alpha_min  # the squared whitened length at which alpha = alpha_min
+        radius = math.sqrt(max(squared_radius, 0.0) / HALF_LOG2E)
+        whiten_xx = math.sqrt(HALF_LOG2E * yy / det)
+        store1(s, OUT_X + k, fx * tan_x + cx)
+        store1(s, OUT_Y + k, fy * tan_y + cy)
+        store1(s, OUT_XX + k, whiten_xx)
+        store1(s, OUT_XY + k, -whiten_xx * uv / yy)
+        store1(s, OUT_YY + k, math.sqrt(HALF_LOG2E / yy))
+        store1(s, OUT_HALF_WIDTH + k, radius * math.sqrt(xx))
+        store1(s, OUT_HALF_HEIGHT + k, radius * math.sqrt(yy))
+        store1(s, OUT_LOG2 + k, log2_opacity)
+
+        # the flattest axis is the surface normal
+        third, first = (s2 <= s0) & (s2 <= s1), s0 <= s1
+        wx = q02 if third else (q00 if first else q01)
+        wy = q12 if third else (q10 if first else q11)
+        wz = q22 if third else (q20 if first else q21)
+        nx, ny, nz = (
+            r00 * wx + r01 * wy + r02 * wz,
+            r10 * wx + r11 * wy + r12 * wz,
+            r20 * wx + r21 * wy + r22 * wz,
+        )
+        facing = -1.0 if nx * x + ny * y + nz * load1(s, Z + k) > 0.0 else 1.0
+        store1(s, OUT_NX + k, facing * nx)
+        store1(s, OUT_NY + k, facing * ny)
+        store1(s, OUT_NZ + k, facing * nz)
+
+
+@exact_kernel
+def _surfels(s, n, camera, low_pass, log2_alpha_min):
+    """The first n staged surfels: their own coordinates as functions of the pixel, and an ellipse around them."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
+        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
+    )  # fmt: skip
+    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
+    for k in range(n):
+        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
+        qw, qx, qy, qz = _load_quat(s, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
+        tx, ty, tz = (
+            r00 * q00 + r01 * q10 + r02 * q20,
+            r10 * q00 + r11 * q10 + r12 * q20,
+            r20 * q00 + r21 * q10 + r22 * q20,
+        )
+        bx, by, bz = (
+            r00 * q01 + r01 * q11 + r02 * q21,
+            r10 * q01 + r11 * q11 + r12 * q21,
+            r20 * q01 + r21 * q11 + r22 * q21,
+        )
+        nx, ny, nz = (
+            r00 * q02 + r01 * q12 + r02 * q22,
+            r10 * q02 + r11 * q12 + r12 * q22,
+            r20 * q02 + r21 * q12 + r22 * q22,
+        )
+        # The ray (x̂, ŷ, 1) z through a pixel meets the plane n·p = n·c at z = n·c / n·(x̂, ŷ, 1).
+        plane = nx * x + ny * y + nz * z
+        seen = plane * plane > EDGE_ON * EDGE_ON * (x * x + y * y + z * z)
+        slope = z / plane if seen else 0.0
+        a_x, a_y = slope * nx / fx, slope * ny / fy
+        scale_u = math.sqrt(HALF_LOG2E) * exp64(-load1(s, S0 + k))
+        scale_v = math.sqrt(HALF_LOG2E) * exp64(-load1(s, S1 + k))
+        along_u, along_v = tx * x + ty * y + tz * z, bx * x + by * y + bz * z
+        u_x, u_y = scale_u * (z * tx / fx - a_x * along_u), scale_u * (z * ty / fy - a_y * along_u)
+        v_x, v_y = scale_v * (z * bx / fx - a_x * along_v), scale_v * (z * by / fy - a_y * along_v)
+        u_x, u_y = (min(max(u_x, -SHARP), SHARP), min(max(u_y, -SHARP), SHARP)) if seen else (SHARP, 0.0)
+        v_x, v_y = (min(max(v_x, -SHARP), SHARP), min(max(v_y, -SHARP), SHARP)) if seen else (0.0, SHARP)
+
+        # |(U·δ, V·δ)|² = r² (1 + A·δ)² is a conic (δ−e)ᵀM(δ−e) = r² (1 + A·e) with e = r² M⁻¹A; where it is no
+        # ellipse, the surfel reaches round the camera and may be seen anywhere.
+        log2_opacity = -log2_64(1.0 + exp64(-load1(s, LOGIT + k)))
+        rr = max(log2_opacity - log2_alpha_min, 0.0)
+        det_uv = u_x * v_y - u_y * v_x
+        cross_u, cross_v = u_x * a_y - u_y * a_x, v_x * a_y - v_y * a_x
+        det = det_uv * det_uv - rr * (cross_u * cross_u + cross_v * cross_v)
+        ellipse = det > 1e-6 * det_uv * det_uv
+        inverse = 1.0 / det if ellipse else 0.0
+        # M⁻¹ = [[myy, −mxy], [−mxy, mxx]] · inverse
+        mxx = u_x * u_x + v_x * v_x - rr * a_x * a_x
+        mxy = u_x * u_y + v_x * v_y - rr * a_x * a_y
+        myy = u_y * u_y + v_y * v_y - rr * a_y * a_y
+        e_x, e_y = rr * (myy * a_x - mxy * a_y) * inverse, rr * (mxx * a_y - mxy * a_x) * inverse
+        level = rr * (1.0 + a_x * e_x + a_y * e_y) * inverse
+        # The ellipse δᵀΣ⁻¹δ = 1; its semi-axes are raised until the low-pass disc around the centre lies inside.
+        sxx, sxy, syy = level * myy, -level * mxy, level * mxx
+        mean, half_gap = 0.5 * (sxx + syy), 0.5 * math.sqrt((sxx - syy) * (sxx - syy) + 4.0 * sxy * sxy)
+        disc = math.sqrt(rr * low_pass / HALF_LOG2E) + math.sqrt(e_x * e_x + e_y * e_y)
+        long, short = max(mean + half_gap, disc * disc), max(mean - half_gap, disc * disc)
+        stretch = (long - short) / (2.0 * half_gap) if half_gap > 1e-9 * mean else 0.0
+        lift = long - stretch * (mean + half_gap)
+        sxx, sxy, syy = stretch * sxx + lift, stretch * sxy, stretch * syy + lift
+        area = long * short
+        bounded = ellipse & (area > 0.0)
+        mean_x, mean_y = fx * x / z + cx, fy * y / z + cy
+        store1(s, OUT_X + k, mean_x + e_x)
+        store1(s, OUT_Y + k, mean_y + e_y)
+        store1(s, OUT_XX + k, math.sqrt(syy / area) if bounded else 1.0 / FAR)
+        store1(s, OUT_XY + k, -sxy / math.sqrt(area * syy) if bounded else 0.0)
+        store1(s, OUT_YY + k, 1.0 / math.sqrt(syy) if bounded else 1.0 / FAR)
+        store1(s, OUT_HALF_WIDTH + k, math.sqrt(sxx) if bounded else FAR)
+        store1(s, OUT_HALF_HEIGHT + k, math.sqrt(syy) if bounded else FAR)
+        store1(s, OUT_LOG2 + k, log2_opacity)
+        facing = -1.0 if plane > 0.0 else 1.0
+        store1(s, OUT_NX + k, facing * nx)
+        store1(s, OUT_NY + k, facing * ny)
+        store1(s, OUT_NZ + k, facing * nz)
+        store1(s, OUT_CENTRE_X + k, mean_x)
+        store1(s, OUT_CENTRE_Y + k, mean_y)
+        store1(s, OUT_UX + k, u_x)
+        store1(s, OUT_UY + k, u_y)
+        store1(s, OUT_VX + k, v_x)
+        store1(s, OUT_VY + k, v_y)
+        store1(s, OUT_AX + k, a_x)
+        store1(s, OUT_AY + k, a_y)
+
+
+@inline_kernel
+def _tile_range(low, high, tiles):
+    """First tile, and one past the last, with a pixel centre between low and high (px)."""
+    first = math.ceil(min(max((low - (TILE - 0.5)) / TILE, 0.0), float64(tiles)))
+    end = math.floor(min(max((high - 0.5) / TILE + 1.0, 0.0), float64(tiles)))
+    return int64(first), int64(end)
 
 
 @exact_kernel
@@ -102,105 +359,109 @@ def project_range(
     lo,
     hi,
     means,  # [N, 3]
-    log_scales,  # [N, 3], or [N, 2] for surfels: their third scale is 0
+    log_scales,  # [N, 3], or [N, 2] for surfels
     quats,  # [N, 4] wxyz
     opacity_logits,  # [N]
     sh,  # [N, K, 3]
     sh_bits,  # [N, 3 K] int32, the same memory
     camera,  # [23] float64: R (9), t (3), fx, fy, cx, cy, centre (3), bounds of x/z and y/z (−x, +x, −y, +y)
-    width,
-    height,
+    across,  # tiles per row of tiles
+    down,
     near,
     low_pass,
     alpha_min,
     antialiased,
     with_colour,
-    features,  # [N, 16] out, filled where DRAWN
+    features,  # [N, 16 or 32] out, filled where DRAWN
+    rects,  # [N, 4] int16 out, filled where DRAWN: first column and row of tiles, and one past the last
     states,  # [N] int8 out: UNUSABLE, HIDDEN or DRAWN
 ):
     """Feature rows of Gaussians lo … hi−1."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
-    )  # fmt: skip
-    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
-    for i in range(lo, hi):
-        if not _usable(i, means, log_scales, quats, opacity_logits, sh_bits):
+    surfels = log_scales.shape[1] == 2
+    flat, row_size = features.reshape(-1), int64(features.shape[1])
+    s, rows = np.empty(PLANES * CHUNK, np.float64), np.empty(CHUNK, np.int64)
+    flat_sh, bands, basis = sh.reshape(-1), sh.shape[1], np.empty(BASIS_PLANES * CHUNK, np.float32)
+    logit_min = -math.log(max(1.0 / alpha_min - 1.0, 1e-300))
+    log2_alpha_min = math.log2(alpha_min)
+    i = lo
+    while i < hi:
+        n = 0
+        while i < hi and n < CHUNK:
+            if not _usable(i, means, log_scales, quats, opacity_logits):
+                states[i] = UNUSABLE
+            else:
+                states[i] = HIDDEN
+                px, py, pz = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
+                z = camera[6] * px + camera[7] * py + camera[8] * pz + camera[11]
+                if near <= z < FAR and opacity_logits[i] > logit_min:
+                    store1(s, X + n, camera[0] * px + camera[1] * py + camera[2] * pz + camera[9])
+                    store1(s, Y + n, camera[3] * px + camera[4] * py + camera[5] * pz + camera[10])
+                    store1(s, Z + n, z)
+                    for k in range(4):
+                        store1(s, QW + k * CHUNK + n, float64(quats[i, k]))
+                    for k in range(log_scales.shape[1]):
+                        store1(s, S0 + k * CHUNK + n, float64(log_scales[i, k]))
+                    store1(s, LOGIT + n, float64(opacity_logits[i]))
+                    rows[n] = i
+                    n += 1
+            i += 1
+        if surfels:
+            _surfels(s, n, camera, low_pass, log2_alpha_min)
+        else:
+            _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased)
+        _emit(s, n, rows, sh_bits, across, down, log2_alpha_min, surfels, flat, row_size, rects, states)
+        if with_colour:
+            sh_basis(s, n, camera, bands, basis)
+            _paint(n, rows, basis, bands, flat_sh, flat, row_size, states)
+
+
+@exact_kernel
+def _emit(s, n, rows, sh_bits, across, down, log2_alpha_min, surfels, flat, row_size, rects, states):
+    """Write the feature rows of the first n staged rows, unless they miss the picture."""
+    for k in range(n):
+        i = rows[k]
+        x, y = load1(s, OUT_X + k), load1(s, OUT_Y + k)
+        half_width, half_height = load1(s, OUT_HALF_WIDTH + k), load1(s, OUT_HALF_HEIGHT + k)
+        x0, x1 = _tile_range(x - half_width, x + half_width, across)
+        y0, y1 = _tile_range(y - half_height, y + half_height, down)
+        log2_opacity, xx = load1(s, OUT_LOG2 + k), load1(s, OUT_XX + k)
+        placed = abs(x) < FAR and abs(y) < FAR and math.isfinite(xx) and log2_opacity > log2_alpha_min
+        if not (placed and x0 < x1 and y0 < y1):
+            continue
+        if not _finite_bits(sh_bits, i):
             states[i] = UNUSABLE
             continue
-        states[i] = HIDDEN
-        px, py, pz = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
-        z = r20 * px + r21 * py + r22 * pz + camera[11]
-        opacity = 1.0 / (1.0 + math.exp(-float64(opacity_logits[i])))
-        if not (near <= z < FAR and opacity > alpha_min):
-            continue
-        x = r00 * px + r01 * py + r02 * pz + camera[9]
-        y = r10 * px + r11 * py + r12 * pz + camera[10]
-        mean_x, mean_y = fx * x / z + cx, fy * y / z + cy
-
-        # Rows of J R: the Jacobian of the perspective times the rotation. Far outside the frustum it is
-        # evaluated at the bounds, or else a splat beside the camera would flood the view.
-        j00, j02 = fx / z, -fx / z * min(max(x / z, camera[19]), camera[20])
-        j11, j12 = fy / z, -fy / z * min(max(y / z, camera[21]), camera[22])
-        a0, a1, a2 = j00 * r00 + j02 * r20, j00 * r01 + j02 * r21, j00 * r02 + j02 * r22
-        b0, b1, b2 = j11 * r10 + j12 * r20, j11 * r11 + j12 * r21, j11 * r12 + j12 * r22
-
-        qw, qx = float64(quats[i, 0]), float64(quats[i, 1])
-        qy, qz = float64(quats[i, 2]), float64(quats[i, 3])
-        norm = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-        qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
-        q00, q01, q02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
-        q10, q11, q12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
-        q20, q21, q22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
-        s0, s1, s2 = math.exp(float64(log_scales[i, 0])), math.exp(float64(log_scales[i, 1])), 0.0
-        if log_scales.shape[1] == 3:
-            s2 = math.exp(float64(log_scales[i, 2]))
-
-        # The image covariance [[uu, uv], [uv, vv]] from u, v = rows of J R Q S. Its determinant is |u × v|²,
-        # so that with the low-pass nothing is subtracted: uu·vv − uv² would cancel for needles.
-        u0, v0 = (a0 * q00 + a1 * q10 + a2 * q20) * s0, (b0 * q00 + b1 * q10 + b2 * q20) * s0
-        u1, v1 = (a0 * q01 + a1 * q11 + a2 * q21) * s1, (b0 * q01 + b1 * q11 + b2 * q21) * s1
-        u2, v2 = (a0 * q02 + a1 * q12 + a2 * q22) * s2, (b0 * q02 + b1 * q12 + b2 * q22) * s2
-        uu, uv, vv = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
-        sharp = (u1 * v2 - u2 * v1) ** 2 + (u2 * v0 - u0 * v2) ** 2 + (u0 * v1 - u1 * v0) ** 2
-        det = sharp + low_pass * (uu + vv) + low_pass * low_pass
-        xx, yy = uu + low_pass, vv + low_pass
-        if not 0.0 < det < math.inf:
-            continue
-        if antialiased:  # mip-splatting: what the low-pass adds to the area is taken from the opacity
-            opacity *= math.sqrt(sharp / det)
-            if not opacity > alpha_min:
-                continue
-
-        radius = math.sqrt(math.log2(opacity / alpha_min))  # whitened length at which alpha = alpha_min
-        half_width, half_height = radius * math.sqrt(xx / HALF_LOG2E), radius * math.sqrt(yy / HALF_LOG2E)
-        outside_x = mean_x + half_width <= 0.0 or mean_x - half_width >= width
-        outside_y = mean_y + half_height <= 0.0 or mean_y - half_height >= height
-        if outside_x or outside_y or not (abs(mean_x) < FAR and abs(mean_y) < FAR):
-            continue
         states[i] = DRAWN
-        f = features[i]
-        whiten_xx = math.sqrt(HALF_LOG2E * yy / det)
-        f[MEAN_X], f[MEAN_Y], f[DEPTH] = mean_x, mean_y, z
-        f[WHITEN_XX], f[WHITEN_XY] = max(whiten_xx, 1.0 / FAR), -whiten_xx * uv / yy
-        f[WHITEN_YY], f[HALF_HEIGHT] = max(math.sqrt(HALF_LOG2E / yy), 1.0 / FAR), min(half_height, FAR)
-        f[LOG2_OPACITY] = math.log2(opacity)
+        rects[i, 0], rects[i, 1], rects[i, 2], rects[i, 3] = x0, y0, x1, y1
+        o = i * row_size
+        store1(flat, o + BOUND_X, float32(x))
+        store1(flat, o + BOUND_Y, float32(y))
+        store1(flat, o + WHITEN_XX, float32(max(xx, 1.0 / FAR)))
+        store1(flat, o + WHITEN_XY, float32(load1(s, OUT_XY + k)))
+        store1(flat, o + WHITEN_YY, float32(max(load1(s, OUT_YY + k), 1.0 / FAR)))
+        store1(flat, o + HALF_HEIGHT, float32(min(half_height, FAR)))
+        store1(flat, o + LOG2_OPACITY, float32(log2_opacity))
+        store1(flat, o + DEPTH, float32(load1(s, Z + k)))
+        for j in range(3):
+            store1(flat, o + NORMAL_X + j, float32(load1(s, OUT_NX + j * CHUNK + k)))
+        if surfels:
+            for j in range(8):  # CENTRE_X … A_Y
+                store1(flat, o + CENTRE_X + j, float32(load1(s, OUT_CENTRE_X + j * CHUNK + k)))
 
-        if with_colour:
-            dx, dy, dz = px - camera[16], py - camera[17], pz - camera[18]
-            inverse = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
-            dir_x, dir_y, dir_z = np.float32(dx * inverse), np.float32(dy * inverse), np.float32(dz * inverse)
-            for c in range(3):
-                f[RED + c] = _colour(sh, i, c, dir_x, dir_y, dir_z)
 
-        # the flattest axis is the surface normal
-        if s2 <= s0 and s2 <= s1:
-            wx, wy, wz = q02, q12, q22
-        elif s0 <= s1:
-            wx, wy, wz = q00, q10, q20
-        else:
-            wx, wy, wz = q01, q11, q21
-        nx = r00 * wx + r01 * wy + r02 * wz
-        ny = r10 * wx + r11 * wy + r12 * wz
-        nz = r20 * wx + r21 * wy + r22 * wz
-        facing = -1.0 if nx * x + ny * y + nz * z > 0.0 else 1.0
-        f[NORMAL_X], f[NORMAL_Y], f[NORMAL_Z] = facing * nx, facing * ny, facing * nz
+@exact_kernel
+def _paint(n, rows, basis, bands, flat_sh, flat, row_size, states):
+    """The colours max(0, 0.5 + Σ Y_k h_k) of the first n staged rows, where they are drawn."""
+    for k in range(n):
+        i = rows[k]
+        if states[i] == DRAWN:
+            red, green, blue = HALF, HALF, HALF
+            h = i * 3 * bands
+            for band in range(bands):
+                y = load1(basis, band * CHUNK + k)
+                red += y * load1(flat_sh, h + 3 * band)
+                green += y * load1(flat_sh, h + 3 * band + 1)
+                blue += y * load1(flat_sh, h + 3 * band + 2)
+            store1(flat, i * row_size + RED, max(red, ZERO))
+            store1(flat, i * row_size + GREEN, max(green, ZERO))
+            store1(flat, i * row_size + BLUE, max(blue, ZERO))

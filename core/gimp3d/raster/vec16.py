@@ -1,13 +1,14 @@
-"""A value type inside numba kernels: 16 float32 lanes, one row of a 16×16 tile.
+"""A value type inside numba kernels: 16 float32 lanes, one block of 4×4 pixels.
 
-LLVM maps `<16 x float>` to one AVX-512 register, two AVX, four SSE or four NEON ones, so that pixels are
-blended 16 at a time without relying on the loop vectoriser. Only what the blend kernels use is here.
+LLVM maps `<16 x float>` to one AVX-512 register, two AVX, four SSE or four NEON ones, so that pixels are blended 16
+at a time without relying on the loop vectoriser. Nothing here is fast-math: the forward and the backward kernels
+must come to the same bits. Only what the kernels use is here.
 """
 
 from __future__ import annotations
 
-import operator
 import struct
+from operator import add, mul, sub, truediv
 from typing import Any
 
 from llvmlite import ir
@@ -17,11 +18,12 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 # The words `jit import` put this file into the hash that names the kernel cache (jit.py): kernels inline it.
 LANES = 16
-FAST = ("fast",)
+I16, I32, I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
-INTEGERS = ir.VectorType(ir.IntType(32), LANES)
+INTEGERS = ir.VectorType(I32, LANES)
 # 2^r on [-0.5, 0.5], highest power first: least relative error, 8e-8, in float32 2e-7 (Taylor: 3e-6)
 EXP2 = (0.00132764714, 0.00967554157, 0.05550713277, 0.24022119720, 0.69314696706, 1.00000007166)
+ROUNDING = 1.5 * 2.0**23  # added to a float32 it leaves the nearest integer in the low mantissa bits
 
 
 class Vec16Type(types.Type):
@@ -46,10 +48,28 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(VECTOR, [rounded] * LANES)
 
 
+def _integers(value: int) -> ir.Constant:
+    return ir.Constant(INTEGERS, [value] * LANES)
+
+
+def _shuffle(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
+
+
 def _splat(builder: Any, scalar: Any) -> Any:
     undefined = ir.Constant(VECTOR, ir.Undefined)
-    first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS, [0] * LANES))
+    return _shuffle(builder, builder.insert_element(undefined, scalar, I32(0)), undefined, [0] * LANES)
+
+
+def _vectors(builder: Any, sig: Any, args: Any) -> list[Any]:
+    """The arguments, scalars spread over the lanes."""
+    return [v if isinstance(t, Vec16Type) else _splat(builder, v) for v, t in zip(args, sig.args)]
+
+
+def _call(builder: Any, name: str, *args: Any) -> Any:
+    """An LLVM intrinsic over whole vectors."""
+    kind = ir.FunctionType(VECTOR, [VECTOR] * len(args))
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32"), args)
 
 
 def _define_operator(op: Any, instruction: str) -> None:
@@ -58,14 +78,13 @@ def _define_operator(op: Any, instruction: str) -> None:
         cases = [signature(vec16, vec16, vec16), signature(vec16, vec16, f32), signature(vec16, f32, vec16)]  # noqa: RUF012
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        a, b = (v if isinstance(t, Vec16Type) else _splat(builder, v) for v, t in zip(args, sig.args))
-        return getattr(builder, instruction)(a, b, flags=FAST)
+        return getattr(builder, instruction)(*_vectors(builder, sig, args))
 
     for left, right in ((Vec16Type, Vec16Type), (Vec16Type, types.Float), (types.Float, Vec16Type)):
         lower_builtin(op, left, right)(lower)
 
 
-for _op, _instruction in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+for _op, _instruction in ((add, "fadd"), (sub, "fsub"), (mul, "fmul"), (truediv, "fdiv")):
     _define_operator(_op, _instruction)
 
 
@@ -110,49 +129,164 @@ def load1(typing: Any, array: Any, index: Any) -> Any:
 
 
 @intrinsic
+def store1(typing: Any, array: Any, index: Any, value: Any) -> Any:
+    """array[index] = value without the wrap-around of negative indices."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        builder.store(args[2], builder.gep(data, [args[1]], inbounds=True))
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, array.dtype), code
+
+
+@intrinsic
+def bits_of(typing: Any, x: Any) -> Any:
+    """The bits of a float64."""
+    return types.int64(types.float64), lambda context, builder, sig, args: builder.bitcast(args[0], I64)
+
+
+@intrinsic
+def float_of(typing: Any, bits: Any) -> Any:
+    """The float64 with these bits."""
+    return types.float64(types.int64), lambda context, builder, sig, args: builder.bitcast(args[0], ir.DoubleType())
+
+
+@intrinsic
 def splat16(typing: Any, scalar: Any) -> Any:
     """The scalar in every lane."""
     return vec16(f32), lambda context, builder, sig, args: _splat(builder, args[0])
 
 
 @intrinsic
-def ramp16(typing: Any, start: Any) -> Any:
-    """start, start + 1, … start + 15."""
+def ramp16(typing: Any) -> Any:
+    """0, 1, … 15."""
+    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k) for k in range(LANES)])
+
+
+@intrinsic
+def columns16(typing: Any) -> Any:
+    """Each lane's column in a block of 4×4 pixels."""
+    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k % 4) for k in range(LANES)])
+
+
+@intrinsic
+def rows16(typing: Any) -> Any:
+    """Each lane's row in a block of 4×4 pixels."""
+    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k // 4) for k in range(LANES)])
+
+
+@intrinsic
+def fma16(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """a · b + c, in one rounding where the machine can."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        steps = ir.Constant(VECTOR, [float(k) for k in range(LANES)])
-        return builder.fadd(_splat(builder, args[0]), steps, flags=FAST)
+        return _call(builder, "fmuladd", *_vectors(builder, sig, args))
 
-    return vec16(f32), code
+    return vec16(a, b, c), code
 
 
 @intrinsic
 def exp2_16(typing: Any, x: Any) -> Any:
-    """2^x per lane for x ≤ 0; below −40 it is 2^−40."""
+    """2^x per lane for x ≤ 0; below −120 it is 2^−120."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        low = _constant(-40.0)
-        x = builder.select(builder.fcmp_ordered(">", args[0], low), args[0], low)
-        whole = builder.fptosi(builder.fsub(x, _constant(0.5), flags=FAST), INTEGERS)
-        r = builder.fsub(x, builder.sitofp(whole, VECTOR), flags=FAST)
+        x = _larger(builder, args[0], _constant(-120.0))
+        shifted = builder.fadd(x, _constant(ROUNDING))
+        r = builder.fsub(x, builder.fsub(shifted, _constant(ROUNDING)))
         p = _constant(EXP2[0])
         for coefficient in EXP2[1:]:
-            p = builder.fadd(builder.fmul(p, r, flags=FAST), _constant(coefficient), flags=FAST)
-        bias, shift = ir.Constant(INTEGERS, [127] * LANES), ir.Constant(INTEGERS, [23] * LANES)
-        power = builder.bitcast(builder.shl(builder.add(whole, bias), shift), VECTOR)
-        return builder.fmul(p, power, flags=FAST)
+            p = _call(builder, "fmuladd", p, r, _constant(coefficient))
+        exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _integers(23))
+        return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
 
     return vec16(vec16), code
 
 
+def _larger(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
 @intrinsic
-def where_greater(typing: Any, x: Any, limit: Any, yes: Any, no: Any) -> Any:
-    """Per lane: yes where x > limit (a scalar), else no."""
+def max16(typing: Any, x: Any, y: Any) -> Any:
+    """The larger per lane; y where x is NaN."""
+    return vec16(x, y), lambda context, builder, sig, args: _larger(builder, *_vectors(builder, sig, args))
+
+
+@intrinsic
+def min16(typing: Any, x: Any, y: Any) -> Any:
+    """The smaller per lane; y where x is NaN."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(builder.fcmp_ordered(">", args[0], _splat(builder, args[1])), args[2], args[3])
+        a, b = _vectors(builder, sig, args)
+        return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
-    return vec16(vec16, f32, vec16, vec16), code
+    return vec16(x, y), code
+
+
+@intrinsic
+def sqrt16(typing: Any, x: Any) -> Any:
+    return vec16(vec16), lambda context, builder, sig, args: _call(builder, "sqrt", args[0])
+
+
+@intrinsic
+def floor16(typing: Any, x: Any) -> Any:
+    return vec16(vec16), lambda context, builder, sig, args: _call(builder, "floor", args[0])
+
+
+def _where(comparison: str) -> Any:
+    def typer(typing: Any, x: Any, y: Any, yes: Any, no: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            a, b, then, other = _vectors(builder, sig, args)
+            return builder.select(builder.fcmp_ordered(comparison, a, b), then, other)
+
+        return vec16(x, y, yes, no), code
+
+    return typer
+
+
+# Per lane: yes where x > y (x == y), else no.
+where_greater = intrinsic(_where(">"))
+where_equal = intrinsic(_where("=="))
+
+
+@intrinsic
+def any_between(typing: Any, x: Any, low: Any, high: Any) -> Any:
+    """Whether low < x < high in any lane."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value, low, high = _vectors(builder, sig, args)
+        inside = builder.and_(builder.fcmp_ordered(">", value, low), builder.fcmp_ordered("<", value, high))
+        return builder.icmp_unsigned("!=", builder.bitcast(inside, I16), I16(0))
+
+    return types.boolean(vec16, f32, f32), code
+
+
+@intrinsic
+def spans_to_bits(typing: Any, first: Any, end: Any) -> Any:
+    """A 64-bit mask: in byte k the bits first_k … end_k − 1, for lanes 0–7 of integers within 0 … 8."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        low, high = (
+            builder.shl(_integers(1), builder.fptosi(v, INTEGERS)) for v in args
+        )
+        span = builder.select(builder.icmp_signed(">", high, low), builder.sub(high, low), _integers(0))
+        low_half = _shuffle(builder, span, span, list(range(8)))
+        return builder.bitcast(builder.trunc(low_half, ir.VectorType(ir.IntType(8), 8)), I64)
+
+    return types.uint64(vec16, vec16), code
+
+
+@intrinsic
+def lowest_bit(typing: Any, bits: Any) -> Any:
+    """Index of the lowest set bit of a mask that is not 0."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(I64, [I64, ir.IntType(1)])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.cttz.i64")
+        return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
+
+    return types.int64(types.uint64), code
 
 
 def _reduction(combine: Any) -> Any:
@@ -160,17 +294,9 @@ def _reduction(combine: Any) -> Any:
         value, lanes = args[0], LANES
         while lanes > 1:  # halves, so that the order of additions is fixed
             lanes //= 2
-            undefined = ir.Constant(value.type, ir.Undefined)
-            low, high = (
-                builder.shuffle_vector(
-                    value,
-                    undefined,
-                    ir.Constant(ir.VectorType(ir.IntType(32), lanes), list(range(start, start + lanes))),
-                )
-                for start in (0, lanes)
-            )
+            low, high = (_shuffle(builder, value, value, list(range(s, s + lanes))) for s in (0, lanes))
             value = combine(builder, low, high)
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
+        return builder.extract_element(value, I32(0))
 
     return code
 
@@ -181,10 +307,6 @@ def sum16(typing: Any, x: Any) -> Any:
     return f32(vec16), _reduction(lambda builder, a, b: builder.fadd(a, b))
 
 
-def _larger(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-
 @intrinsic
 def highest16(typing: Any, x: Any) -> Any:
     """The largest lane."""
@@ -192,9 +314,23 @@ def highest16(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
-def max16(typing: Any, x: Any, y: Any) -> Any:
-    """The larger of two vectors, lane by lane."""
-    return vec16(vec16, vec16), lambda context, builder, sig, args: _larger(builder, args[0], args[1])
+def sums16(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any,
+           i: Any, j: Any, k: Any, l: Any, m: Any, n: Any, o: Any, p: Any) -> Any:  # fmt: skip
+    """Lane k is the sum of the lanes of the k-th vector: 16 sums for the work of three."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        vectors, width = list(args), LANES
+        while len(vectors) > 1:  # every group of `width` lanes is added to half its width, two vectors to one
+            width //= 2
+            low = [k for k in range(2 * LANES) if k // width % 2 == 0]
+            high = [k + width for k in low]
+            vectors = [
+                builder.fadd(_shuffle(builder, x, y, low), _shuffle(builder, x, y, high))
+                for x, y in zip(vectors[::2], vectors[1::2])
+            ]
+        return vectors[0]
+
+    return vec16(*[vec16] * LANES), code
 
 
 @intrinsic
@@ -202,11 +338,11 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
     """Ask the memory for the cache line of array[index]: the blend loop jumps between feature rows."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        byte = ir.IntType(8).as_pointer()
         pointer = _pointer(context, builder, sig.args[0], args[0], args[1], ir.IntType(8))
-        kind = ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
+        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, i32(0), i32(3), i32(1)])
+        builder.call(function, [pointer, I32(0), I32(3), I32(1)])
         return context.get_dummy_value()
 
     return types.void(array, types.int64), code

@@ -1,0 +1,371 @@
+"""The CPU rasteriser: project → bin → blend, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera
+from ..gaussians import Gaussians
+from ..threads import parallel_map, run_ranges, thread_count
+from .bin import TileLists, tile_lists
+from .blend import BLOCKS, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .project import (
+    BLUE,
+    DEPTH,
+    ELLIPSE_ROW,
+    HALF_LOG2E,
+    RED,
+    SURFEL_ROW,
+    TILE,
+    UNUSABLE,
+    project_range,
+)
+from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering
+from .unblend import RECORD, unblend_range
+from .unproject import unproject_range
+
+FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
+NO_STATES = np.empty((0, TILE_STATE), np.float32)
+NO_MASKS = np.empty(0, np.uint64)
+
+
+@dataclass(frozen=True)
+class View:
+    """Gaussians projected into a camera."""
+
+    features: np.ndarray  # [N, 16 or 32] float32
+    rects: np.ndarray  # [N, 4] int16
+    states: np.ndarray  # [N] int8
+
+    @property
+    def ignored(self) -> int:
+        return int(np.count_nonzero(self.states == UNUSABLE))
+
+
+def project(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, out: View | None = None
+) -> View:
+    """Feature rows of the Gaussians that reach the picture; into `out` where it is given."""
+    n = len(gaussians)
+    if out is None:
+        features = aligned_rows(n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW)
+        out = View(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+    sh = raw(gaussians.sh)
+    across, down = tile_grid(camera)
+    run_ranges(
+        project_range,
+        n,
+        raw(gaussians.means),
+        raw(gaussians.log_scales),
+        raw(gaussians.quats),
+        raw(gaussians.opacity_logits),
+        sh,
+        sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
+        pack_camera(camera),
+        across,
+        down,
+        float(settings.near),
+        float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
+        float(settings.alpha_min),
+        bool(gaussians.antialiased),
+        with_colour,
+        out.features,
+        out.rects,
+        out.states,
+    )
+    return out
+
+
+def aligned_rows(count: int, width: int) -> np.ndarray:
+    """Room for [count, width] float32 that begins with a cache line: rows astride two lines cost twice."""
+    room = np.empty(count * width + 16, np.float32)
+    skip = (-(room.ctypes.data // 4)) % 16
+    return room[skip : skip + count * width].reshape(count, width)
+
+
+def raw(values: np.ndarray) -> np.ndarray:
+    """The values as kernels always get them: another layout, or read-only memory, would compile them anew."""
+    return np.require(values, np.float32, ["C", "A", "W"])
+
+
+def tile_grid(camera: Camera) -> tuple[int, int]:
+    """Tiles (across, down) of a camera's picture."""
+    return -(-int(camera.width) // TILE), -(-int(camera.height) // TILE)
+
+
+def pack_camera(camera: Camera) -> np.ndarray:
+    """What project_range reads of a camera, [23] float64; the Jacobian's bounds are gsplat's."""
+    margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * camera.width, 0.5 * FRUSTUM_MARGIN * camera.height
+    bounds = [
+        (-camera.cx - margin_x) / camera.fx,
+        (camera.width - camera.cx + margin_x) / camera.fx,
+        (-camera.cy - margin_y) / camera.fy,
+        (camera.height - camera.cy + margin_y) / camera.fy,
+    ]
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return np.concatenate([camera.R.ravel(), camera.t, intrinsics, camera.centre, bounds]).astype(np.float64)
+
+
+def pass_flags(passes: frozenset[str]) -> np.ndarray:
+    """blend_range's flags, [5] bool: rgb, expected depth, median depth, normals, distortion.
+
+    Raises
+    ------
+    ValueError
+        If a pass is unknown.
+    """
+    if unknown := passes - PASSES:
+        raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
+    either_depth = bool(passes & {"depth", "expected_depth"})
+    return np.array(["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes])
+
+
+def pack_limits(settings: RasterSettings) -> np.ndarray:
+    """blend_range's limits, [6] float32."""
+    disc = HALF_LOG2E / settings.surfel_low_pass
+    limits = [settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near]
+    return np.array(limits, np.float32)
+
+
+def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
+    """rgb, alpha, expected, median, normals, distortion: zeros where asked for, else without pixels."""
+    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
+    channels = ((3,), (), (), (), (3,), ())
+    size = (int(camera.height), int(camera.width))
+    return tuple(np.zeros((*(size if w else (0, 0)), *c), np.float32) for w, c in zip(wanted, channels))
+
+
+def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
+    across, down = tile_grid(camera)
+    columns = np.minimum(-(-(camera.width - TILE * np.arange(across)) // 4), 8).astype(np.uint64)
+    rows = np.minimum(-(-(camera.height - TILE * np.arange(down)) // 4), 8).astype(np.uint64)
+    first_column = np.uint64(0x0101010101010101) >> (np.uint64(64) - np.uint64(8) * rows)
+    wanted = ((np.uint64(1) << columns) - np.uint64(1))[None] * first_column[:, None]
+    return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the way back needs of a rendering."""
+
+    gaussians: Gaussians
+    camera: Camera
+    settings: RasterSettings
+    flags: np.ndarray
+    view: View
+    lists: TileLists
+    wanted: np.ndarray  # [S] uint64
+    shifts: np.ndarray  # [S] float32
+    masks: np.ndarray  # [P] uint64
+    closings: np.ndarray  # uint64
+    ends: np.ndarray  # [S] int64
+    states: np.ndarray  # [S, TILE_STATE] float32
+    back: np.ndarray  # [S, TILE_STATE] or empty
+
+
+def disparity_shifts(lists: TileLists, features: np.ndarray, settings: RasterSettings) -> np.ndarray:
+    """A typical distortion_near / z of each tile, [S] float32: that of the middle entry."""
+    shifts = np.zeros(len(lists.tiles), np.float32)
+    filled = np.flatnonzero(np.diff(lists.starts))
+    middle = lists.entries[(lists.starts[filled] + lists.starts[filled + 1]) // 2]
+    shifts[filled] = np.float32(settings.distortion_near) / features[middle, DEPTH]
+    return shifts
+
+
+def render(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+) -> Rendering:
+    return _draw(gaussians, camera, settings, passes, keep=False)[0]
+
+
+def trace(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+) -> tuple[Rendering, Trace]:
+    return _draw(gaussians, camera, settings, passes, keep=True)
+
+
+def _draw(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], keep: bool
+) -> tuple[Rendering, Trace]:
+    flags = pass_flags(passes)
+    view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
+    slots, wanted = whole_picture(camera)
+    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
+    pictures, kept = blend(view, lists, wanted, gaussians, camera, settings, flags, keep)
+    return Rendering(*pictures, view.ignored), kept
+
+
+def blend(
+    view: View,
+    lists: TileLists,
+    wanted: np.ndarray,
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    flags: np.ndarray,
+    keep: bool,
+    front: np.ndarray = NO_STATES,
+    back: np.ndarray = NO_STATES,
+) -> tuple[tuple[np.ndarray, ...], Trace]:
+    """Blend the lists into pictures."""
+    slot_count, entry_count = len(lists.tiles), len(lists.entries)
+    kept = Trace(
+        gaussians,
+        camera,
+        settings,
+        flags,
+        view,
+        lists,
+        wanted,
+        disparity_shifts(lists, view.features, settings),
+        np.empty(entry_count, np.uint64) if keep else NO_MASKS,
+        np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
+        np.empty(slot_count, np.int64),
+        aligned_rows(slot_count, TILE_STATE) if keep else NO_STATES,
+        back,
+    )
+    pictures = empty_pictures(camera, flags)
+    over_tiles(
+        blend_range,
+        lists,
+        camera,
+        view.features,
+        gaussians.is_surfels,
+        pack_limits(settings),
+        kept.shifts,
+        flags,
+        wanted,
+        front,
+        kept.masks,
+        kept.closings,
+        kept.ends,
+        kept.states,
+        np.asarray(settings.background, np.float32),
+        back,
+        pictures,
+    )
+    return pictures, kept
+
+
+def backward(traced: Trace, given: PictureGradients, first_active: int = 0) -> Gradients:
+    lists, view, settings = traced.lists, traced.view, traced.settings
+    gradients = [raw(getattr(given, f.name)) for f in fields(given)]
+    check_gradients(given, traced.camera)
+    flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
+    missing = [name for name, g, f in zip(("rgb", "expected_depth", "median_depth", "normals", "distortion"), flags, traced.flags) if g and not f]
+    if missing:
+        raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
+    records = aligned_rows(int(lists.counts.sum()), RECORD)
+    over_tiles(
+        unblend_range,
+        lists,
+        traced.camera,
+        view.features,
+        traced.gaussians.is_surfels,
+        pack_limits(settings),
+        traced.shifts,
+        flags,
+        traced.wanted,
+        traced.masks,
+        traced.closings,
+        traced.ends,
+        traced.states,
+        np.asarray(settings.background, np.float32),
+        traced.back,
+        tuple(gradients),
+        first_active,
+        lists.records,
+        records.reshape(-1),
+    )
+    return unproject(traced, records, first_active)
+
+
+def unproject(traced: Trace, records: np.ndarray, first_active: int) -> Gradients:
+    """Gradients of the traced Gaussians, which are the feature rows from first_active on."""
+    gaussians, settings, lists = traced.gaussians, traced.settings, traced.lists
+    out = Gradients(
+        np.empty_like(gaussians.means, np.float32),
+        np.empty_like(gaussians.log_scales, np.float32),
+        np.empty_like(gaussians.quats, np.float32),
+        np.empty_like(gaussians.opacity_logits, np.float32),
+        np.empty_like(gaussians.sh, np.float32),
+    )
+    run_ranges(
+        unproject_range,
+        len(gaussians),
+        first_active,
+        raw(gaussians.means),
+        raw(gaussians.log_scales),
+        raw(gaussians.quats),
+        raw(gaussians.opacity_logits),
+        raw(gaussians.sh),
+        pack_camera(traced.camera),
+        float(settings.low_pass),
+        bool(gaussians.antialiased),
+        traced.view.features,
+        traced.view.states,
+        lists.counts,
+        np.cumsum(lists.counts, dtype=np.int64) - lists.counts,
+        records.reshape(-1),
+        out.means,
+        out.log_scales,
+        out.quats,
+        out.opacity_logits,
+        out.sh,
+    )
+    return out
+
+
+def check_gradients(given: PictureGradients, camera: Camera) -> None:
+    """Every picture's gradient is empty or has the picture's shape."""
+    for f in fields(given):
+        value = getattr(given, f.name)
+        expected = (camera.height, camera.width, *((3,) if f.name in ("rgb", "normals") else ()))
+        if value.size and value.shape != expected:
+            raise ValueError(f"gradient of {f.name}: expected shape {expected}, got {value.shape}")
+
+
+def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
+    """Run a tile kernel over all slots: longest first, dealt round-robin, so that threads end together."""
+    order = np.argsort(-np.diff(lists.starts), kind="stable")
+    chunks = 1 if thread_count() == 1 else 6 * thread_count()
+    across, _ = tile_grid(camera)
+    size = (int(camera.width), int(camera.height))
+    parallel_map(
+        lambda part: kernel_range(0, len(part), part, lists.tiles, across, *size, lists.starts, lists.entries, *args),
+        [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)],
+    )
+
+
+def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings) -> np.ndarray:
+    if chosen.shape != (len(gaussians),):
+        raise ValueError(f"chosen: expected shape {(len(gaussians),)}, got {chosen.shape}")
+    view = project(gaussians, camera, settings, with_colour=False)
+    view.features[:, RED : BLUE + 1] = chosen[:, None]  # painted white on black
+    slots, wanted = whole_picture(camera)
+    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
+    black = replace(settings, background=(0.0, 0.0, 0.0))
+    pictures, _ = blend(view, lists, wanted, gaussians, camera, black, pass_flags(frozenset({"rgb"})), keep=False)
+    return np.ascontiguousarray(pictures[0][..., 0])
+
+
+def contributions(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
+) -> Contributions:
+    shape = (camera.height, camera.width)
+    counted = np.ones(shape, bool) if pixels is None else np.require(pixels, bool, ["C", "W"])
+    if counted.shape != shape:
+        raise ValueError(f"pixels: expected shape {shape}, got {counted.shape}")
+    view = project(gaussians, camera, settings, with_colour=False)
+    lists = tile_lists(view.features, view.rects, view.states, whole_picture(camera)[0], with_records=False)
+    sums, peaks = np.zeros((2, len(lists.entries)), np.float32)
+    limits = pack_limits(settings)
+    over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)
+    total, peak = np.zeros((2, len(gaussians)), np.float32)
+    gather_weights(lists.entries, sums, peaks, total, peak)
+    return Contributions(total, peak)

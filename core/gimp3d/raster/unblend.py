@@ -1,0 +1,403 @@
+"""The way back through a tile's blending: from pictures' gradients to sums per list entry.
+
+Every entry has its own record of 16 float32, so that no two threads ever add to the same place: the gradients are the
+same for any number of threads. Going back to front, T is divided by 1 − alpha, and `behind` is what a pixel would
+show if everything up to here were taken away: dL/dalpha_i = T_i (v_i − behind_i), behind ← behind + alpha (v − behind),
+where v is a Gaussian's value under the pixel's gradient. The walk repeats forward's arithmetic bit for bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import float32, int64, uint64
+
+from ..jit import exact_kernel, inline_kernel
+from .bin import ONE
+from .blend import (
+    BLOCK,
+    BLOCK_PX,
+    BLOCK_STATE,
+    BLOCKS,
+    CHECK,
+    CLOSED,
+    HELD,
+    M1,
+    M2,
+    MEDIAN,
+    NOTHING,
+    NX,
+    NY,
+    NZ,
+    R,
+    T,
+    Z,
+    aligned_empty,
+    ellipse_alpha,
+    surfel_alpha,
+    total,
+)
+from .project import (
+    A_X,
+    A_Y,
+    BLUE,
+    BOUND_X,
+    BOUND_Y,
+    CENTRE_X,
+    CENTRE_Y,
+    DEPTH,
+    GREEN,
+    HALF,
+    LN2,
+    LOG2_OPACITY,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    RED,
+    TILE,
+    U_X,
+    U_Y,
+    V_X,
+    V_Y,
+    WHITEN_XX,
+    WHITEN_XY,
+    WHITEN_YY,
+    ZERO,
+)
+from .vec16 import (
+    columns16,
+    fma16,
+    load1,
+    load16,
+    lowest_bit,
+    max16,
+    prefetch,
+    rows16,
+    splat16,
+    sqrt16,
+    store1,
+    store16,
+    sums16,
+    where_equal,
+    where_greater,
+)
+
+RECORD = 16
+# A 3D Gaussian's record: sums over pixels. p is the gradient with respect to ln alpha, (dx, dy) the offset from its
+# centre. A surfel's record has the same first four, p in LOG_ALPHA, and after it the gradients of U, V, A and CENTRE.
+D_RED, D_GREEN, D_BLUE, D_DEPTH, LOG_ALPHA = range(5)
+P_X, P_Y, P_XX, P_XY, P_YY = range(5, 10)
+D_U_X, D_U_Y, D_V_X, D_V_Y, D_A_X, D_A_Y, D_CENTRE_X, D_CENTRE_Y = range(5, 13)
+D_NORMAL_X, D_NORMAL_Y, D_NORMAL_Z = 13, 14, 15
+
+# Planes of a block on the way back: T, which is 0 until a closed pixel is opened again, what lies behind, now and at
+# the START; gradients with respect to the sums of the same name and the sum of weights; the median's gradient and entry.
+BEHIND, G_W, G_R, G_G, G_B, G_Z, G_MEDIAN, MEDIAN_ENTRY, G_NX, G_NY, G_NZ, G_M1, G_M2, START = range(16, 15 * 16, 16)
+BACK_STATE = 15 * 16
+TWICE_LN2, TWO = np.float32(2 * LN2), np.float32(2)
+
+
+@exact_kernel
+def unblend_range(
+    lo,
+    hi,
+    order,  # [S] slots in the order in which they are done
+    tiles,  # [S]
+    across,
+    width,
+    height,
+    starts,  # [S+1]
+    entries,  # [P]
+    features,  # [N, 16 or 32]
+    surfels,
+    limits,  # [6] float32, as blend_range
+    shifts,  # [S]
+    flags,  # [5] bool: gradients of rgb, expected depth, median depth, normals, distortion are given
+    wanted,  # [S] uint64
+    masks,  # [P] uint64
+    closings,  # uint64
+    ends,  # [S]
+    states,  # [S, TILE_STATE] what blend_range left
+    background,  # [3]
+    back,  # [S, TILE_STATE] or empty
+    gradients,  # (rgb, alpha, expected, median, normals, distortion), without pixels where not given
+    first_active,  # rows below are frozen: they get no record
+    record_rows,  # [P] int64
+    records,  # [Q · 16] out
+):
+    """Records of the slots order[lo:hi]."""
+    alpha_min, alpha_max = limits[0], limits[1]
+    near, disc, distortion_near = limits[3], limits[4], limits[5]
+    with_rgb, with_depth, with_median, with_normals, with_distortion = flags[0], flags[1], flags[2], flags[3], flags[4]
+    flat, row_size = features.reshape(-1), int64(features.shape[1])
+    column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
+    work = aligned_empty(BLOCKS * BACK_STATE)
+    for j in range(lo, hi):
+        slot = order[j]
+        left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
+        state, shift = states[slot], shifts[slot]
+        first, end = starts[slot], starts[slot + 1]
+        _prepare(state, work, wanted[slot], left, top, width, height, flags, background, back, slot, gradients)
+        for i in range(ends[slot], end):
+            if entries[i] >= first_active:
+                store16(records, record_rows[i] * RECORD, none)
+        for i in range(ends[slot] - 1, first - 1, -1):
+            done = i + 1 - first
+            if done % CHECK == 0:
+                _reopen(state, work, closings[first // CHECK + slot + done // CHECK], float32(done))
+            mask = masks[i]
+            o = int64(entries[i]) * row_size
+            prefetch(flat, int64(entries[max(i - CHECK, first)]) * row_size)
+            number = splat16(float32(done))
+            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
+            red, green, blue = load1(flat, o + RED), load1(flat, o + GREEN), load1(flat, o + BLUE)
+            nx, ny, nz = load1(flat, o + NORMAL_X), load1(flat, o + NORMAL_Y), load1(flat, o + NORMAL_Z)
+            active = entries[i] >= first_active
+            s_red, s_green, s_blue, s_depth, s_log = none, none, none, none, none
+            s_nx, s_ny, s_nz = none, none, none
+            if surfels:
+                x, y = float32(left) + HALF - load1(flat, o + CENTRE_X), float32(top) + HALF - load1(flat, o + CENTRE_Y)
+                u_x, u_y = load1(flat, o + U_X), load1(flat, o + U_Y)
+                v_x, v_y = load1(flat, o + V_X), load1(flat, o + V_Y)
+                a_x, a_y = load1(flat, o + A_X), load1(flat, o + A_Y)
+                disparity = distortion_near / depth
+                s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy = none, none, none, none, none, none, none, none
+                while mask:
+                    b = lowest_bit(mask)
+                    mask &= mask - uint64(1)
+                    k = b * BACK_STATE
+                    dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
+                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
+                    den = fma16(dx, a_x, fma16(dy, a_y, one))
+                    free, alpha, inverse, blurred = surfel_alpha(
+                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
+                    )
+                    z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
+                    m = where_greater(blurred, ZERO, one, den) * disparity - shift
+                    value = _value(work, k, flags, red, green, blue, z, nx, ny, nz, m)
+                    weight, p = _step(work, k, alpha, value)
+                    if active:
+                        if with_rgb:
+                            s_red, s_green, s_blue = (
+                                fma16(weight, load16(work, k + G_R), s_red),
+                                fma16(weight, load16(work, k + G_G), s_green),
+                                fma16(weight, load16(work, k + G_B), s_blue),
+                            )
+                        if with_normals:
+                            s_nx, s_ny, s_nz = (
+                                fma16(weight, load16(work, k + G_NX), s_nx),
+                                fma16(weight, load16(work, k + G_NY), s_ny),
+                                fma16(weight, load16(work, k + G_NZ), s_nz),
+                            )
+                        p = where_greater(free, alpha_max, ZERO, p)
+                        s_log = s_log + p
+                        # what moves 1 + A·δ: the depth of the ray, and the distortion
+                        d_z, d_m = _depth_gradients(work, k, flags, weight, m, number)
+                        d_inverse = d_z * depth
+                        d_den = d_m * disparity
+                        s_depth = s_depth + where_greater(blurred, ZERO, d_z, d_z * inverse)
+                        s_depth = s_depth - d_m * (disparity / depth) * where_greater(blurred, ZERO, one, den)
+                        # ln alpha = ln opacity − ln 2 ((U·δ)² + (V·δ)²) / (1 + A·δ)²
+                        p_ray = where_greater(blurred, ZERO, ZERO, p) * TWICE_LN2
+                        d_u, d_v = ZERO - p_ray * u * inverse * inverse, ZERO - p_ray * v * inverse * inverse
+                        d_inverse = d_inverse - p_ray * fma16(u, u, v * v) * inverse
+                        d_a = where_greater(blurred, ZERO, ZERO, d_den - d_inverse * inverse * inverse)
+                        s_ux, s_uy = fma16(d_u, dx, s_ux), fma16(d_u, dy, s_uy)
+                        s_vx, s_vy = fma16(d_v, dx, s_vx), fma16(d_v, dy, s_vy)
+                        s_ax, s_ay = fma16(d_a, dx, s_ax), fma16(d_a, dy, s_ay)
+                        p_disc = where_greater(blurred, ZERO, p, ZERO) * (TWICE_LN2 * disc)
+                        s_cx = s_cx + fma16(p_disc, dx, ZERO - fma16(d_u, u_x, fma16(d_v, v_x, d_a * a_x)))
+                        s_cy = s_cy + fma16(p_disc, dy, ZERO - fma16(d_u, u_y, fma16(d_v, v_y, d_a * a_y)))
+                if active:
+                    sums = sums16(
+                        s_red, s_green, s_blue, s_depth, s_log, s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy,
+                        s_nx, s_ny, s_nz,
+                    )  # fmt: skip
+                    store16(records, record_rows[i] * RECORD, sums)
+            else:
+                x, y = float32(left) + HALF - load1(flat, o + BOUND_X), float32(top) + HALF - load1(flat, o + BOUND_Y)
+                xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+                along0, down0 = fma16(column, xx, row * xy), row * yy
+                disparity = distortion_near / depth
+                z, m = splat16(depth), splat16(disparity - shift)
+                q, q_x, q_y, q_xx, q_xy, q_yy, s_m = none, none, none, none, none, none, none
+                while mask:
+                    b = lowest_bit(mask)
+                    mask &= mask - uint64(1)
+                    k = b * BACK_STATE
+                    dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
+                    free, alpha = ellipse_alpha(
+                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
+                    )
+                    value = _value(work, k, flags, red, green, blue, z, nx, ny, nz, m)
+                    weight, p = _step(work, k, alpha, value)
+                    if active:
+                        if with_rgb:
+                            s_red, s_green, s_blue = (
+                                fma16(weight, load16(work, k + G_R), s_red),
+                                fma16(weight, load16(work, k + G_G), s_green),
+                                fma16(weight, load16(work, k + G_B), s_blue),
+                            )
+                        if with_normals:
+                            s_nx, s_ny, s_nz = (
+                                fma16(weight, load16(work, k + G_NX), s_nx),
+                                fma16(weight, load16(work, k + G_NY), s_ny),
+                                fma16(weight, load16(work, k + G_NZ), s_nz),
+                            )
+                        d_z, d_m = _depth_gradients(work, k, flags, weight, m, number)
+                        s_depth, s_m = s_depth + d_z, s_m + d_m
+                        p = where_greater(free, alpha_max, ZERO, p)
+                        # Moments about the block's corner: the offset within it is the same for all blocks.
+                        p_x, p_y = p * dx, p * dy
+                        q, q_x, q_y = q + p, q_x + p_x, q_y + p_y
+                        q_xx, q_xy, q_yy = fma16(p_x, dx, q_xx), fma16(p_x, dy, q_xy), fma16(p_y, dy, q_yy)
+                if active:
+                    s_xx = fma16(column, fma16(column, q, TWO * q_x), q_xx)
+                    s_xy = fma16(column, fma16(row, q, q_y), fma16(row, q_x, q_xy))
+                    s_yy = fma16(row, fma16(row, q, TWO * q_y), q_yy)
+                    s_depth = s_depth - s_m * (disparity / depth)
+                    sums = sums16(
+                        s_red, s_green, s_blue, s_depth, q, fma16(column, q, q_x), fma16(row, q, q_y), s_xx, s_xy, s_yy,
+                        none, none, none, s_nx, s_ny, s_nz,
+                    )  # fmt: skip
+                    store16(records, record_rows[i] * RECORD, sums)
+
+
+@inline_kernel
+def _value(work, k, flags, red, green, blue, z, nx, ny, nz, m):
+    """A Gaussian's value under each pixel's gradient."""
+    value = load16(work, k + G_W)
+    if flags[0]:
+        value = fma16(load16(work, k + G_R), red, value)
+        value = fma16(load16(work, k + G_G), green, fma16(load16(work, k + G_B), blue, value))
+    if flags[1]:
+        value = fma16(load16(work, k + G_Z), z, value)
+    if flags[3]:
+        value = fma16(load16(work, k + G_NX), nx, value)
+        value = fma16(load16(work, k + G_NY), ny, fma16(load16(work, k + G_NZ), nz, value))
+    if flags[4]:
+        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
+    return value
+
+
+@inline_kernel
+def _step(work, k, alpha, value):
+    """Take a Gaussian away from the pixels; (its weight, the gradient with respect to ln alpha)."""
+    before = load16(work, k + T) / (ONE - alpha)
+    store16(work, k + T, before)
+    weight = alpha * before
+    behind = load16(work, k + BEHIND)
+    difference = value - behind
+    store16(work, k + BEHIND, fma16(alpha, difference, behind))
+    return weight, weight * difference
+
+
+@inline_kernel
+def _depth_gradients(work, k, flags, weight, m, number):
+    """Gradients with respect to a Gaussian's z and to its distortion_near / z at each pixel."""
+    d_z, d_m = splat16(ZERO), splat16(ZERO)
+    if flags[1]:
+        d_z = weight * load16(work, k + G_Z)
+    if flags[2]:
+        d_z = d_z + where_equal(load16(work, k + MEDIAN_ENTRY), number, load16(work, k + G_MEDIAN), ZERO)
+    if flags[4]:
+        d_m = weight * fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
+    return d_z, d_m
+
+
+@inline_kernel
+def _reopen(state, work, mask, entry):
+    """Pixels that were closed after this many entries take part from here on."""
+    while mask:
+        b = lowest_bit(mask)
+        mask &= mask - uint64(1)
+        k, w = b * BLOCK_STATE, b * BACK_STATE
+        closed = load16(state, k + CLOSED)
+        store16(work, w + T, where_equal(closed, entry, load16(state, k + HELD), load16(work, w + T)))
+        store16(work, w + BEHIND, where_equal(closed, entry, load16(work, w + START), load16(work, w + BEHIND)))
+
+
+@inline_kernel
+def _prepare(state, work, mask, left, top, width, height, flags, background, back, slot, gradients):
+    """The pixels' gradients with respect to the sums over Gaussians, from those of the pictures."""
+    d_rgb, d_alpha, d_expected, d_median, d_normals, d_distortion = gradients
+    given = np.zeros(9 * 16, np.float32)  # r, g, b, alpha, expected, nx, ny, nz, distortion
+    while mask:
+        b = lowest_bit(mask)
+        mask &= mask - uint64(1)
+        k, w = b * BLOCK_STATE, b * BACK_STATE
+        given[:] = ZERO
+        store16(work, w + G_MEDIAN, splat16(ZERO))
+        u0, v0 = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
+        for y in range(min(BLOCK, height - v0)):
+            for x in range(min(BLOCK, width - u0)):
+                lane, u, v = 4 * y + x, u0 + x, v0 + y
+                if flags[0]:
+                    for c in range(3):
+                        store1(given, 16 * c + lane, d_rgb[v, u, c])
+                if len(d_alpha):
+                    store1(given, 48 + lane, d_alpha[v, u])
+                if flags[1]:
+                    store1(given, 64 + lane, d_expected[v, u])
+                if flags[2]:
+                    store1(work, w + G_MEDIAN + lane, d_median[v, u])
+                if flags[3]:
+                    for c in range(3):
+                        store1(given, 80 + 16 * c + lane, d_normals[v, u, c])
+                if flags[4]:
+                    store1(given, 128 + lane, d_distortion[v, u])
+        clear = load16(state, k + T) + load16(state, k + HELD)
+        passing = clear
+        if len(back):
+            passing = clear * (load16(back[slot], k + T) + load16(back[slot], k + HELD))
+        weight, g_w, g_z = ONE - passing, load16(given, 48), splat16(ZERO)
+        behind = splat16(ZERO)  # what shows where no Gaussian is left
+        if flags[0]:
+            for c in range(3):
+                g = load16(given, 16 * c)
+                store16(work, w + G_R + 16 * c, g)
+                behind = fma16(g, background[c], behind)
+        if flags[1]:
+            enough = where_greater(weight, NOTHING, ONE / max16(weight, NOTHING), ZERO)
+            g_z = load16(given, 64) * enough
+            g_w = g_w - g_z * total(state, back, slot, k, Z, clear) * enough
+            store16(work, w + G_Z, g_z)
+        if flags[3]:
+            nx, ny, nz = (
+                total(state, back, slot, k, NX, clear),
+                total(state, back, slot, k, NY, clear),
+                total(state, back, slot, k, NZ, clear),
+            )
+            length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
+            inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
+            nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+            g_x, g_y, g_n = load16(given, 80), load16(given, 96), load16(given, 112)
+            along = fma16(g_x, nx, fma16(g_y, ny, g_n * nz))
+            store16(work, w + G_NX, (g_x - along * nx) * inverse)
+            store16(work, w + G_NY, (g_y - along * ny) * inverse)
+            store16(work, w + G_NZ, (g_n - along * nz) * inverse)
+        if flags[4]:
+            g = load16(given, 128)
+            m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
+            store16(work, w + G_M1, ZERO - g * m1 * TWO)
+            store16(work, w + G_M2, g * weight)
+            g_w = fma16(g, m2, g_w)
+        store16(work, w + G_W, g_w)
+        if len(back):
+            # the layer behind is one Gaussian of alpha 1 − T whose value is that of its sums
+            through = load16(back[slot], k + T) + load16(back[slot], k + HELD)
+            behind = fma16(through, behind, g_w * (ONE - through))
+            if flags[0]:
+                for c in range(3):
+                    behind = fma16(load16(work, w + G_R + 16 * c), load16(back[slot], k + R + 16 * c), behind)
+            if flags[1]:
+                behind = fma16(g_z, load16(back[slot], k + Z), behind)
+            if flags[3]:
+                for c in range(3):
+                    behind = fma16(load16(work, w + G_NX + 16 * c), load16(back[slot], k + NX + 16 * c), behind)
+            if flags[4]:
+                behind = fma16(load16(work, w + G_M1), load16(back[slot], k + M1), behind)
+                behind = fma16(load16(work, w + G_M2), load16(back[slot], k + M2), behind)
+        store16(work, w + BEHIND, behind)
+        store16(work, w + START, behind)
+        store16(work, w + T, load16(state, k + T))
+        store16(work, w + MEDIAN_ENTRY, load16(state, k + MEDIAN))
