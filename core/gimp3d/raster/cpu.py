@@ -166,6 +166,10 @@ class Trace:
     ends: np.ndarray  # [S] int64
     states: np.ndarray  # [S, TILE_STATE] float32
     back: np.ndarray  # [S, TILE_STATE] or empty
+    first_active: int  # feature rows below are of frozen Gaussians
+
+    def backward(self, gradients: PictureGradients) -> Gradients:
+        return _backward(self, gradients)
 
 
 def disparity_shifts(lists: TileLists, features: np.ndarray, settings: RasterSettings) -> np.ndarray:
@@ -211,6 +215,7 @@ def blend(
     keep: bool,
     front: np.ndarray = NO_STATES,
     back: np.ndarray = NO_STATES,
+    first_active: int = 0,
 ) -> tuple[tuple[np.ndarray, ...], Trace]:
     """Blend the lists into pictures."""
     slot_count, entry_count = len(lists.tiles), len(lists.entries)
@@ -228,6 +233,7 @@ def blend(
         np.empty(slot_count, np.int64),
         aligned_rows(slot_count, TILE_STATE) if keep else NO_STATES,
         back,
+        first_active,
     )
     pictures = empty_pictures(camera, flags)
     over_tiles(
@@ -252,7 +258,7 @@ def blend(
     return pictures, kept
 
 
-def backward(traced: Trace, given: PictureGradients, first_active: int = 0) -> Gradients:
+def _backward(traced: Trace, given: PictureGradients) -> Gradients:
     lists, view, settings = traced.lists, traced.view, traced.settings
     gradients = [raw(getattr(given, f.name)) for f in fields(given)]
     check_gradients(given, traced.camera)
@@ -278,15 +284,15 @@ def backward(traced: Trace, given: PictureGradients, first_active: int = 0) -> G
         np.asarray(settings.background, np.float32),
         traced.back,
         tuple(gradients),
-        first_active,
+        traced.first_active,
         lists.records,
         records.reshape(-1),
     )
-    return unproject(traced, records, first_active)
+    return _unproject(traced, records)
 
 
-def unproject(traced: Trace, records: np.ndarray, first_active: int) -> Gradients:
-    """Gradients of the traced Gaussians, which are the feature rows from first_active on."""
+def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
+    """Gradients of the traced Gaussians, the feature rows from first_active on."""
     gaussians, settings, lists = traced.gaussians, traced.settings, traced.lists
     out = Gradients(
         np.empty_like(gaussians.means, np.float32),
@@ -298,7 +304,7 @@ def unproject(traced: Trace, records: np.ndarray, first_active: int) -> Gradient
     run_ranges(
         unproject_range,
         len(gaussians),
-        first_active,
+        traced.first_active,
         raw(gaussians.means),
         raw(gaussians.log_scales),
         raw(gaussians.quats),

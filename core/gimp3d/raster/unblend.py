@@ -173,25 +173,31 @@ def unblend_range(
                     )
                     z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
                     m = where_greater(blurred, ZERO, one, den) * disparity - shift
-                    value = _value(work, k, flags, red, green, blue, z, nx, ny, nz, m)
+                    value = load16(work, k + G_W)
+                    if with_rgb:
+                        value = _three(work, k, G_R, red, green, blue, value)
+                    if with_depth:
+                        value = fma16(load16(work, k + G_Z), z, value)
+                    if with_normals:
+                        value = _three(work, k, G_NX, nx, ny, nz, value)
+                    if with_distortion:
+                        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
                     weight, p = _step(work, k, alpha, value)
                     if active:
                         if with_rgb:
-                            s_red, s_green, s_blue = (
-                                fma16(weight, load16(work, k + G_R), s_red),
-                                fma16(weight, load16(work, k + G_G), s_green),
-                                fma16(weight, load16(work, k + G_B), s_blue),
-                            )
+                            s_red, s_green, s_blue = _add_three(work, k, G_R, weight, s_red, s_green, s_blue)
                         if with_normals:
-                            s_nx, s_ny, s_nz = (
-                                fma16(weight, load16(work, k + G_NX), s_nx),
-                                fma16(weight, load16(work, k + G_NY), s_ny),
-                                fma16(weight, load16(work, k + G_NZ), s_nz),
-                            )
+                            s_nx, s_ny, s_nz = _add_three(work, k, G_NX, weight, s_nx, s_ny, s_nz)
                         p = where_greater(free, alpha_max, ZERO, p)
                         s_log = s_log + p
                         # what moves 1 + A·δ: the depth of the ray, and the distortion
-                        d_z, d_m = _depth_gradients(work, k, flags, weight, m, number)
+                        d_z, d_m = none, none
+                        if with_depth:
+                            d_z = weight * load16(work, k + G_Z)
+                        if with_median:
+                            d_z = d_z + _median_gradient(work, k, number)
+                        if with_distortion:
+                            d_m = weight * fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
                         d_inverse = d_z * depth
                         d_den = d_m * disparity
                         s_depth = s_depth + where_greater(blurred, ZERO, d_z, d_z * inverse)
@@ -228,23 +234,28 @@ def unblend_range(
                     free, alpha = ellipse_alpha(
                         along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
                     )
-                    value = _value(work, k, flags, red, green, blue, z, nx, ny, nz, m)
+                    value = load16(work, k + G_W)
+                    if with_rgb:
+                        value = _three(work, k, G_R, red, green, blue, value)
+                    if with_depth:
+                        value = fma16(load16(work, k + G_Z), z, value)
+                    if with_normals:
+                        value = _three(work, k, G_NX, nx, ny, nz, value)
+                    if with_distortion:
+                        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
                     weight, p = _step(work, k, alpha, value)
                     if active:
                         if with_rgb:
-                            s_red, s_green, s_blue = (
-                                fma16(weight, load16(work, k + G_R), s_red),
-                                fma16(weight, load16(work, k + G_G), s_green),
-                                fma16(weight, load16(work, k + G_B), s_blue),
-                            )
+                            s_red, s_green, s_blue = _add_three(work, k, G_R, weight, s_red, s_green, s_blue)
                         if with_normals:
-                            s_nx, s_ny, s_nz = (
-                                fma16(weight, load16(work, k + G_NX), s_nx),
-                                fma16(weight, load16(work, k + G_NY), s_ny),
-                                fma16(weight, load16(work, k + G_NZ), s_nz),
-                            )
-                        d_z, d_m = _depth_gradients(work, k, flags, weight, m, number)
-                        s_depth, s_m = s_depth + d_z, s_m + d_m
+                            s_nx, s_ny, s_nz = _add_three(work, k, G_NX, weight, s_nx, s_ny, s_nz)
+                        if with_depth:
+                            s_depth = fma16(weight, load16(work, k + G_Z), s_depth)
+                        if with_median:
+                            s_depth = s_depth + _median_gradient(work, k, number)
+                        if with_distortion:
+                            d_m = fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
+                            s_m = fma16(weight, d_m, s_m)
                         p = where_greater(free, alpha_max, ZERO, p)
                         # Moments about the block's corner: the offset within it is the same for all blocks.
                         p_x, p_y = p * dx, p * dy
@@ -262,21 +273,22 @@ def unblend_range(
                     store16(records, record_rows[i] * RECORD, sums)
 
 
+# The helpers inside the loop over blocks have no branches: numba would count references around each.
 @inline_kernel
-def _value(work, k, flags, red, green, blue, z, nx, ny, nz, m):
-    """A Gaussian's value under each pixel's gradient."""
-    value = load16(work, k + G_W)
-    if flags[0]:
-        value = fma16(load16(work, k + G_R), red, value)
-        value = fma16(load16(work, k + G_G), green, fma16(load16(work, k + G_B), blue, value))
-    if flags[1]:
-        value = fma16(load16(work, k + G_Z), z, value)
-    if flags[3]:
-        value = fma16(load16(work, k + G_NX), nx, value)
-        value = fma16(load16(work, k + G_NY), ny, fma16(load16(work, k + G_NZ), nz, value))
-    if flags[4]:
-        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
-    return value
+def _three(work, k, plane, x, y, z, value):
+    """value + the planes' product with (x, y, z)."""
+    value = fma16(load16(work, k + plane), x, value)
+    return fma16(load16(work, k + plane + 16), y, fma16(load16(work, k + plane + 32), z, value))
+
+
+@inline_kernel
+def _add_three(work, k, plane, weight, x, y, z):
+    """(x, y, z) + weight · the planes."""
+    return (
+        fma16(weight, load16(work, k + plane), x),
+        fma16(weight, load16(work, k + plane + 16), y),
+        fma16(weight, load16(work, k + plane + 32), z),
+    )
 
 
 @inline_kernel
@@ -292,16 +304,9 @@ def _step(work, k, alpha, value):
 
 
 @inline_kernel
-def _depth_gradients(work, k, flags, weight, m, number):
-    """Gradients with respect to a Gaussian's z and to its distortion_near / z at each pixel."""
-    d_z, d_m = splat16(ZERO), splat16(ZERO)
-    if flags[1]:
-        d_z = weight * load16(work, k + G_Z)
-    if flags[2]:
-        d_z = d_z + where_equal(load16(work, k + MEDIAN_ENTRY), number, load16(work, k + G_MEDIAN), ZERO)
-    if flags[4]:
-        d_m = weight * fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
-    return d_z, d_m
+def _median_gradient(work, k, number):
+    """The median depth's gradient where this list entry is the median."""
+    return where_equal(load16(work, k + MEDIAN_ENTRY), number, load16(work, k + G_MEDIAN), ZERO)
 
 
 @inline_kernel

@@ -1,0 +1,83 @@
+"""The rasteriser as a torch function. Tensors and arrays share their memory; nothing is copied."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..camera import Camera
+from ..gaussians import Gaussians
+from . import ALL_PASSES, PictureGradients, RasterSettings, Region, trace
+
+PICTURES = ("rgb", "alpha", "expected_depth", "median_depth", "normals", "distortion")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """As `Rendering`, in torch; pictures that were not asked for are None."""
+
+    rgb: torch.Tensor | None  # [H, W, 3] float32
+    alpha: torch.Tensor  # [H, W]
+    expected_depth: torch.Tensor | None  # [H, W]
+    median_depth: torch.Tensor | None  # [H, W]
+    normals: torch.Tensor | None  # [H, W, 3]
+    distortion: torch.Tensor | None  # [H, W]
+
+
+def rasterize(
+    means: torch.Tensor,  # [N, 3]
+    log_scales: torch.Tensor,  # [N, 3], or [N, 2] for surfels
+    quats: torch.Tensor,  # [N, 4] wxyz
+    opacity_logits: torch.Tensor,  # [N]
+    sh: torch.Tensor,  # [N, K, 3]
+    view: Camera | Region,
+    settings: RasterSettings = RasterSettings(),
+    passes: frozenset[str] = ALL_PASSES,
+    antialiased: bool = False,
+) -> Pictures:
+    """Draw Gaussians so that a loss on the pictures flows back to them.
+
+    Parameters
+    ----------
+    means, log_scales, quats, opacity_logits, sh
+        Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
+        forward and backward: torch checks that.
+    view
+        A camera; or a region, whose own settings and passes then count, and whose frozen Gaussians are drawn along.
+
+    Raises
+    ------
+    ValueError
+        If a tensor is of another type, on another device or not contiguous (it would have to be copied).
+    """
+    tensors = (means, log_scales, quats, opacity_logits, sh)
+    for name, t in zip(("means", "log_scales", "quats", "opacity_logits", "sh"), tensors):
+        if t.dtype != torch.float32 or t.device.type != "cpu" or not t.is_contiguous():
+            raise ValueError(f"{name}: expected a contiguous float32 tensor on the CPU, got {t.dtype} on {t.device}")
+    drawn = _Rasterize.apply(*tensors, view, settings, passes, antialiased)
+    return Pictures(*(picture if picture.numel() else None for picture in drawn))
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor, ...]:
+        *tensors, view, settings, passes, antialiased = args
+        gaussians = Gaussians(*(t.detach().numpy() for t in tensors), antialiased)  # type: ignore[misc]
+        if isinstance(view, Region):
+            rendering, ctx.traced = view.trace(gaussians)
+        else:
+            rendering, ctx.traced = trace(gaussians, view, settings, passes)
+        ctx.save_for_backward(*tensors)  # so that torch notices if they are changed in place
+        ctx.set_materialize_grads(False)
+        return tuple(torch.from_numpy(getattr(rendering, name)) for name in PICTURES)
+
+    @staticmethod
+    def backward(ctx: Any, *given: torch.Tensor | None) -> tuple[Any, ...]:
+        _ = ctx.saved_tensors
+        gradients = {n: np.ascontiguousarray(g.numpy()) for n, g in zip(PICTURES, given) if g is not None and g.numel()}
+        g = ctx.traced.backward(PictureGradients(**gradients))
+        out = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
+        return (*(torch.from_numpy(v) for v in out), None, None, None, None)
