@@ -40,13 +40,14 @@ SLACK_PX, SLACK = np.float32(0.01), np.float32(5e-4)  # of the bound, for float3
 
 @dataclass(frozen=True)
 class TileLists:
-    """Slot s is tile `tiles[s]`; it blends entries[starts[s]:starts[s + 1]], near to far."""
+    """Slot s is tile `tiles[s]`; it blends entries[starts[s]:stops[s]], near to far."""
 
     tiles: np.ndarray  # [S] int32, row-major tile numbers
-    starts: np.ndarray  # [S+1] int64
+    starts: np.ndarray  # [S] int64
+    stops: np.ndarray  # [S] int64
     entries: np.ndarray  # [P] int32, rows of features
     counts: np.ndarray  # [N] int32, tiles that each Gaussian is in; empty if records were not asked for
-    records: np.ndarray  # [P] int64, each entry's own row for sums: a Gaussian's are consecutive; −1: not recorded
+    records: np.ndarray  # [P] int64, each entry's own row for sums: a Gaussian's are consecutive
 
 
 def tile_lists(
@@ -78,7 +79,7 @@ def tile_lists(
         if with_records:
             records, next_record = np.empty(starts[-1], np.int64), np.cumsum(per_row, dtype=np.int64) - per_row
         parallel_map(deal, range(len(bounds) - 1))
-    return TileLists(tiles, starts, entries, per_row, records)
+    return TileLists(tiles, starts[:-1], starts[1:], entries, per_row, records)
 
 
 def _chunks(count: int) -> list[int]:

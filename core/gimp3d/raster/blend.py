@@ -109,6 +109,13 @@ def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, 
     return free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
 
 
+@exact_kernel
+def region_blocks(pixels, across, blocks):
+    """The blocks of each tile that have a wanted pixel: pixels [H, W] bool, blocks [T] uint64 out."""
+    for t in range(len(blocks)):
+        blocks[t] = open_blocks(pixels, t % across * TILE, t // across * TILE, pixels.shape[1], pixels.shape[0])
+
+
 @inline_kernel
 def open_blocks(pixels, left, top, width, height):
     """A mask of the tile's blocks that have a wanted pixel."""
@@ -118,14 +125,6 @@ def open_blocks(pixels, left, top, width, height):
             if pixels[v, u]:
                 mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
     return mask
-
-
-@inline_kernel
-def picture_blocks(left, top, width, height):
-    """A mask of the tile's blocks that have a pixel of the picture."""
-    columns, rows = min((width - left + BLOCK - 1) // BLOCK, 8), min((height - top + BLOCK - 1) // BLOCK, 8)
-    first_column = uint64(0x0101010101010101) >> uint64(64 - 8 * rows)
-    return ((uint64(1) << uint64(columns)) - uint64(1)) * first_column
 
 
 @inline_kernel
@@ -162,6 +161,21 @@ def _close(state, size, mask, entry, stop):
     return still, closing
 
 
+@inline_kernel
+def _open(state, mask, stop):
+    """Of a state to go on from: close what is dark, forget when pixels closed; the blocks of `mask` with open ones."""
+    _, _ = _close(state, BLOCK_STATE, mask, ZERO, stop)
+    still = uint64(0)
+    while mask:
+        b = lowest_bit(mask)
+        bit = mask & (~mask + uint64(1))
+        mask ^= bit
+        store16(state, b * BLOCK_STATE + CLOSED, splat16(ZERO))
+        if highest16(load16(state, b * BLOCK_STATE + T)) > ZERO:
+            still |= bit
+    return still
+
+
 @exact_kernel
 def blend_range(
     lo,
@@ -171,7 +185,8 @@ def blend_range(
     across,
     width,
     height,
-    starts,  # [S+1]
+    starts,  # [S] first entry of each slot
+    stops,  # [S] one past the last
     entries,  # [P]
     features,  # [N, 16 or 32]
     surfels,  # features are of surfels
@@ -186,7 +201,8 @@ def blend_range(
     states,  # [S, TILE_STATE] out; [0, …] if the caller needs only the pictures
     background,  # [3]
     back,  # [S, TILE_STATE] what lies behind the entries, or empty
-    pictures,  # (rgb [H, W, 3], alpha, expected, median [H, W], normals [H, W, 3], distortion [H, W]) out
+    pictures,  # (rgb [H, W, 3], alpha, expected, median [H, W], normals [H, W, 3], distortion [H, W]) out; without
+    # pixels where not asked for, and if alpha has none, only the states are made
 ):
     """Blend the tiles of slots order[lo:hi]."""
     alpha_min, alpha_max, stop = limits[0], limits[1], limits[2]
@@ -208,8 +224,8 @@ def blend_range(
                 store16(state, b * BLOCK_STATE + T, one)
         alive, shift = wanted[slot], shifts[slot]
         if len(front):
-            alive, closing = _close(state, BLOCK_STATE, alive, ZERO, stop)
-        first, end, i = starts[slot], starts[slot + 1], starts[slot]
+            alive = _open(state, alive, stop)
+        first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size
             if (i - first) % CHECK == 0:
@@ -286,8 +302,9 @@ def blend_range(
                 if len(closings):
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
-        _finish(state, left, top, width, height, wanted[slot], first, entries, features, surfels, limits, flags,
-                background, back, slot, pictures)  # fmt: skip
+        if len(pictures[1]):
+            _finish(state, left, top, width, height, wanted[slot], first, entries, features, surfels, limits, flags,
+                    background, back, slot, pictures)  # fmt: skip
 
 
 @inline_kernel
@@ -375,7 +392,6 @@ def _finish(
                     expected[v, u] = load1(out, 64 + lane)
                 if flags[2]:
                     number = load1(state, k + MEDIAN + lane)
-                    median[v, u] = -number  # a layer in front keeps the depth itself, with a minus
                     if number > ZERO:
                         median[v, u] = depth_at(features[entries[first + int64(number) - 1]], u, v, surfels, limits)
                 if flags[3]:
@@ -409,6 +425,7 @@ def weigh_range(
     width,
     height,
     starts,
+    stops,
     entries,
     features,
     surfels,
@@ -434,7 +451,7 @@ def weigh_range(
                     if pixels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x]:
                         state[k + COUNTED + 4 * y + x] = ONE
         alive = open_blocks(pixels, left, top, width, height)
-        first, end, i = starts[slot], starts[slot + 1], starts[slot]
+        first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size
             if (i - first) % CHECK == 0:

@@ -31,6 +31,7 @@ from .unproject import unproject_range
 FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
+NO_PICTURES = tuple(np.empty((0, 0, *c), np.float32) for c in ((3,), (), (), (), (3,), ()))
 
 
 @dataclass(frozen=True)
@@ -153,11 +154,12 @@ def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 class Trace:
     """What the way back needs of a rendering."""
 
-    gaussians: Gaussians
+    gaussians: Gaussians  # those that get gradients
+    view: View  # of them
     camera: Camera
     settings: RasterSettings
     flags: np.ndarray
-    view: View
+    features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
     lists: TileLists
     wanted: np.ndarray  # [S] uint64
     shifts: np.ndarray  # [S] float32
@@ -166,7 +168,6 @@ class Trace:
     ends: np.ndarray  # [S] int64
     states: np.ndarray  # [S, TILE_STATE] float32
     back: np.ndarray  # [S, TILE_STATE] or empty
-    first_active: int  # feature rows below are of frozen Gaussians
 
     def backward(self, gradients: PictureGradients) -> Gradients:
         return _backward(self, gradients)
@@ -175,8 +176,8 @@ class Trace:
 def disparity_shifts(lists: TileLists, features: np.ndarray, settings: RasterSettings) -> np.ndarray:
     """A typical distortion_near / z of each tile, [S] float32: that of the middle entry."""
     shifts = np.zeros(len(lists.tiles), np.float32)
-    filled = np.flatnonzero(np.diff(lists.starts))
-    middle = lists.entries[(lists.starts[filled] + lists.starts[filled + 1]) // 2]
+    filled = np.flatnonzero(lists.stops > lists.starts)
+    middle = lists.entries[(lists.starts[filled] + lists.stops[filled]) // 2]
     shifts[filled] = np.float32(settings.distortion_near) / features[middle, DEPTH]
     return shifts
 
@@ -200,50 +201,52 @@ def _draw(
     view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
     slots, wanted = whole_picture(camera)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
-    pictures, kept = blend(view, lists, wanted, gaussians, camera, settings, flags, keep)
+    shifts = disparity_shifts(lists, view.features, settings)
+    pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
     return Rendering(*pictures, view.ignored), kept
 
 
 def blend(
-    view: View,
-    lists: TileLists,
-    wanted: np.ndarray,
     gaussians: Gaussians,
+    view: View,
     camera: Camera,
     settings: RasterSettings,
     flags: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    wanted: np.ndarray,
+    shifts: np.ndarray,
     keep: bool,
     front: np.ndarray = NO_STATES,
     back: np.ndarray = NO_STATES,
-    first_active: int = 0,
 ) -> tuple[tuple[np.ndarray, ...], Trace]:
     """Blend the lists into pictures."""
     slot_count, entry_count = len(lists.tiles), len(lists.entries)
     kept = Trace(
         gaussians,
+        view,
         camera,
         settings,
         flags,
-        view,
+        features,
         lists,
         wanted,
-        disparity_shifts(lists, view.features, settings),
+        shifts,
         np.empty(entry_count, np.uint64) if keep else NO_MASKS,
         np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
         np.empty(slot_count, np.int64),
         aligned_rows(slot_count, TILE_STATE) if keep else NO_STATES,
         back,
-        first_active,
     )
     pictures = empty_pictures(camera, flags)
     over_tiles(
         blend_range,
         lists,
         camera,
-        view.features,
+        features,
         gaussians.is_surfels,
         pack_limits(settings),
-        kept.shifts,
+        shifts,
         flags,
         wanted,
         front,
@@ -259,7 +262,7 @@ def blend(
 
 
 def _backward(traced: Trace, given: PictureGradients) -> Gradients:
-    lists, view, settings = traced.lists, traced.view, traced.settings
+    lists, settings = traced.lists, traced.settings
     gradients = [raw(getattr(given, f.name)) for f in fields(given)]
     check_gradients(given, traced.camera)
     flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
@@ -271,7 +274,7 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
         unblend_range,
         lists,
         traced.camera,
-        view.features,
+        traced.features,
         traced.gaussians.is_surfels,
         pack_limits(settings),
         traced.shifts,
@@ -284,7 +287,7 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
         np.asarray(settings.background, np.float32),
         traced.back,
         tuple(gradients),
-        traced.first_active,
+        len(traced.features) - len(traced.gaussians),
         lists.records,
         records.reshape(-1),
     )
@@ -292,7 +295,7 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
 
 
 def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
-    """Gradients of the traced Gaussians, the feature rows from first_active on."""
+    """Gradients of the traced Gaussians."""
     gaussians, settings, lists = traced.gaussians, traced.settings, traced.lists
     out = Gradients(
         np.empty_like(gaussians.means, np.float32),
@@ -304,7 +307,6 @@ def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
     run_ranges(
         unproject_range,
         len(gaussians),
-        traced.first_active,
         raw(gaussians.means),
         raw(gaussians.log_scales),
         raw(gaussians.quats),
@@ -338,12 +340,13 @@ def check_gradients(given: PictureGradients, camera: Camera) -> None:
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
     """Run a tile kernel over all slots: longest first, dealt round-robin, so that threads end together."""
-    order = np.argsort(-np.diff(lists.starts), kind="stable")
-    chunks = 1 if thread_count() == 1 else 6 * thread_count()
+    order = np.argsort(lists.starts - lists.stops, kind="stable")
+    threads = thread_count()
+    chunks = 1 if threads == 1 else min(6 * threads, max(threads, len(order) // 4))
     across, _ = tile_grid(camera)
-    size = (int(camera.width), int(camera.height))
+    shared = (lists.tiles, across, int(camera.width), int(camera.height), lists.starts, lists.stops, lists.entries)
     parallel_map(
-        lambda part: kernel_range(0, len(part), part, lists.tiles, across, *size, lists.starts, lists.entries, *args),
+        lambda part: kernel_range(0, len(part), part, *shared, *args),
         [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)],
     )
 
@@ -356,7 +359,8 @@ def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings
     slots, wanted = whole_picture(camera)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
     black = replace(settings, background=(0.0, 0.0, 0.0))
-    pictures, _ = blend(view, lists, wanted, gaussians, camera, black, pass_flags(frozenset({"rgb"})), keep=False)
+    flags, shifts = pass_flags(frozenset({"rgb"})), np.zeros(len(wanted), np.float32)
+    pictures, _ = blend(gaussians, view, camera, black, flags, view.features, lists, wanted, shifts, keep=False)
     return np.ascontiguousarray(pictures[0][..., 0])
 
 

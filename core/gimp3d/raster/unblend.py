@@ -105,7 +105,8 @@ def unblend_range(
     across,
     width,
     height,
-    starts,  # [S+1]
+    starts,  # [S]
+    stops,  # [S]
     entries,  # [P]
     features,  # [N, 16 or 32]
     surfels,
@@ -135,7 +136,7 @@ def unblend_range(
         slot = order[j]
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state, shift = states[slot], shifts[slot]
-        first, end = starts[slot], starts[slot + 1]
+        first, end = starts[slot], stops[slot]
         _prepare(state, work, wanted[slot], left, top, width, height, flags, background, back, slot, gradients)
         for i in range(ends[slot], end):
             if entries[i] >= first_active:

@@ -63,7 +63,6 @@ MEAN, SCALE, QUAT, OUT_SIZE = 0, 3, 6, 10  # where a row's gradients are gathere
 def unproject_range(
     lo,
     hi,
-    first_row,  # of these Gaussians among the feature rows
     means,  # [N, 3]
     log_scales,  # [N, 3 or 2]
     quats,  # [N, 4]
@@ -72,10 +71,10 @@ def unproject_range(
     camera,  # [23] float64, as project_range
     low_pass,
     antialiased,
-    features,  # [·, 16 or 32]
-    states,  # [·] int8
-    counts,  # [·] int32, records of each row
-    first_records,  # [·] int64
+    features,  # [N, 16 or 32]
+    states,  # [N] int8
+    counts,  # [N] int32, records of each row
+    first_records,  # [N] int64
     records,  # [Q · 16]
     d_means,  # [N, 3] out
     d_log_scales,  # [N, 3 or 2] out
@@ -88,8 +87,7 @@ def unproject_range(
     sums, out = np.empty(RECORD, np.float32), np.empty(OUT_SIZE, np.float64)
     flat_sh, flat_d_sh, bands = sh.reshape(-1), d_sh.reshape(-1), sh.shape[1]
     for i in range(lo, hi):
-        row = first_row + i
-        if states[row] != DRAWN or counts[row] == 0:
+        if states[i] != DRAWN or counts[i] == 0:
             for k in range(3):
                 d_means[i, k] = ZERO
             for k in range(log_scales.shape[1]):
@@ -101,16 +99,15 @@ def unproject_range(
                 store1(flat_d_sh, i * 3 * bands + k, ZERO)
             continue
         total = splat16(ZERO)
-        first = first_records[row]
-        for r in range(first, first + counts[row]):
+        first = first_records[i]
+        for r in range(first, first + counts[i]):
             total = total + load16(records, r * RECORD)
         store16(sums, 0, total)
         if surfels:
             _surfel(i, means, log_scales, quats, camera, sums, out)
         else:
             _ellipse(i, means, log_scales, quats, opacity_logits, camera, low_pass, antialiased, sums, out)
-        f = features[row]
-        _colour(i, bands, means, camera, flat_sh, f, sums, flat_d_sh, out)
+        _colour(i, bands, means, camera, flat_sh, features[i], sums, flat_d_sh, out)
         for k in range(3):
             d_means[i, k] = out[MEAN + k]
         for k in range(log_scales.shape[1]):

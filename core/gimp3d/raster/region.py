@@ -1,0 +1,236 @@
+"""A part of a view where some Gaussians change from one rendering to the next, and the rest of the scene does not.
+
+What does not change is projected, dealt into tiles and, where it pays, blended only once: in every tile the frozen
+Gaussians before the nearest active one, and those behind the farthest, are kept per pixel as a layer in front and a
+layer behind. Only what lies between is blended again. When an active Gaussian leaves a tile's slab of depths, that
+tile's layers are made anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..camera import Camera
+from ..gaussians import Gaussians
+from ..jit import exact_kernel
+from . import cpu
+from .bin import TileLists, tile_lists
+from .blend import TILE_STATE, blend_range, region_blocks
+from .project import DEPTH, ELLIPSE_ROW, SURFEL_ROW
+from .types import Gradients, PictureGradients, RasterSettings, Rendering
+
+SLAB_MARGIN = 0.02  # of the depth: how far active Gaussians may move before layers are made anew
+WORTH_LAYERS = 0.5  # a tile gets layers if its slab holds fewer of its frozen entries than this
+
+
+class Region:
+    """Wanted pixels of a view over a frozen scene. Not for two threads at once.
+
+    The layers need no median depth: with the pass `depth`, everything in the tiles is blended every time.
+    """
+
+    def __init__(
+        self,
+        frozen: Gaussians,
+        camera: Camera,
+        pixels: np.ndarray,  # [H, W] bool: 4×4 blocks around them are drawn, the rest of the pictures is 0
+        settings: RasterSettings = RasterSettings(),
+        passes: frozenset[str] = frozenset({"rgb", "alpha"}),
+    ) -> None:
+        if pixels.shape != (camera.height, camera.width):
+            raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
+        self.camera, self.settings, self.passes = camera, settings, passes
+        self._flags = cpu.pass_flags(passes)
+        across, down = cpu.tile_grid(camera)
+        blocks = np.empty(across * down, np.uint64)
+        region_blocks(np.require(pixels, bool, ["C", "W"]), across, blocks)
+        self._slots = np.full(across * down, -1, np.int32)
+        self._slots[blocks > 0] = np.arange(np.count_nonzero(blocks))
+        self._slots = self._slots.reshape(down, across)
+        self._wanted = blocks[blocks > 0]
+
+        view = cpu.project(frozen, camera, settings, with_colour=bool(self._flags[0]))
+        self._ignored = view.ignored
+        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
+        rows, entries = np.unique(lists.entries, return_inverse=True)
+        self._frozen_count, self._surfels = len(rows), frozen.is_surfels
+        self._features = cpu.aligned_rows(len(rows), view.features.shape[1])
+        self._features[:] = view.features[rows]
+        self._lists = replace(lists, entries=entries.astype(np.int32).ravel())
+        self._depths = np.ascontiguousarray(self._features[self._lists.entries, DEPTH])
+        self._shifts = cpu.disparity_shifts(self._lists, self._features, settings)
+        slots = len(self._wanted)
+        self._layered = np.zeros(slots, bool)
+        self._near, self._far = np.empty((2, slots), np.float32)  # the slabs of depths that the layers leave out
+        self._slab_starts, self._slab_stops = lists.starts.copy(), lists.stops.copy()
+        layered = slots if not self._flags[2] else 0
+        self._front, self._back = cpu.aligned_rows(layered, TILE_STATE), cpu.aligned_rows(layered, TILE_STATE)
+        self._renderings = 0
+
+    def render(self, active: Gaussians) -> Rendering:
+        """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
+        return self._draw(active, keep=False)[0]
+
+    def trace(self, active: Gaussians) -> tuple[Rendering, RegionTrace]:
+        """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
+        return self._draw(active, keep=True)
+
+    def _draw(self, active: Gaussians, keep: bool) -> tuple[Rendering, RegionTrace]:
+        if active.is_surfels != self._surfels:
+            raise ValueError("cannot draw 3D Gaussians and surfels together")
+        self._renderings += 1
+        view = self._project(active)
+        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=keep)
+        if len(self._front):
+            self._renew_layers(view, lists)
+        merged = self._merge(view, lists)
+        pictures, kept = cpu.blend(
+            active,
+            view,
+            self.camera,
+            self.settings,
+            self._flags,
+            self._features,
+            merged,
+            self._wanted,
+            self._shifts,
+            keep,
+            self._front,
+            self._back,
+        )
+        return Rendering(*pictures, self._ignored + view.ignored), RegionTrace(self, self._renderings, kept)
+
+    def _project(self, active: Gaussians) -> cpu.View:
+        """Project the active Gaussians into feature rows behind the frozen ones."""
+        needed = self._frozen_count + len(active)
+        if len(self._features) != needed:
+            before = self._features
+            self._features = cpu.aligned_rows(needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW)
+            self._features[: self._frozen_count] = before[: self._frozen_count]
+        n = len(active)
+        out = cpu.View(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
+        return cpu.project(active, self.camera, self.settings, bool(self._flags[0]), out)
+
+    def _renew_layers(self, view: cpu.View, lists: TileLists) -> None:
+        """Make the layers of tiles whose active Gaussians have left the slab of depths that they were made for."""
+        filled = np.flatnonzero(lists.stops > lists.starts)
+        near, far = np.full((2, len(lists.tiles)), np.nan, np.float32)
+        near[filled] = view.features[lists.entries[lists.starts[filled]], DEPTH]
+        far[filled] = view.features[lists.entries[lists.stops[filled] - 1], DEPTH]
+        stale = np.flatnonzero(~self._layered | (near < self._near) | (far > self._far))
+        if not len(stale):
+            return
+        starts, stops = self._lists.starts[stale], self._lists.stops[stale]
+        empty = np.isnan(near[stale])
+        self._near[stale] = np.where(empty, np.inf, near[stale] * np.float32(1 - SLAB_MARGIN))
+        self._far[stale] = np.where(empty, -np.inf, far[stale] * np.float32(1 + SLAB_MARGIN))
+        slab_starts, slab_stops = np.empty_like(starts), np.empty_like(stops)
+        _find_slabs(self._depths, starts, stops, self._near[stale], self._far[stale], slab_starts, slab_stops)
+        whole = slab_stops - slab_starts > WORTH_LAYERS * (stops - starts)
+        slab_starts[whole], slab_stops[whole] = starts[whole], stops[whole]
+        self._near[stale[whole]], self._far[stale[whole]] = 0.0, np.inf
+        self._slab_starts[stale], self._slab_stops[stale], self._layered[stale] = slab_starts, slab_stops, True
+        self._front[stale] = self._layer(stale, starts, slab_starts)
+        self._back[stale] = self._layer(stale, slab_stops, stops)
+
+    def _layer(self, slots: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
+        """The state of the slots' tiles after a part of their frozen entries, [·, TILE_STATE]."""
+        states = cpu.aligned_rows(len(slots), TILE_STATE)
+        cpu.over_tiles(
+            blend_range,
+            replace(self._lists, tiles=self._lists.tiles[slots], starts=starts, stops=stops),
+            self.camera,
+            self._features,
+            self._surfels,
+            cpu.pack_limits(self.settings),
+            self._shifts[slots],
+            self._flags,
+            self._wanted[slots],
+            cpu.NO_STATES,
+            cpu.NO_MASKS,
+            cpu.NO_MASKS,
+            np.empty(len(slots), np.int64),
+            states,
+            np.zeros(3, np.float32),
+            cpu.NO_STATES,
+            cpu.NO_PICTURES,
+        )
+        return states
+
+    def _merge(self, view: cpu.View, lists: TileLists) -> TileLists:
+        """Frozen entries of the slabs and active ones in one list, by depth, frozen first where that is equal."""
+        counts = (self._slab_stops - self._slab_starts) + (lists.stops - lists.starts)
+        stops = np.cumsum(counts)
+        entries = np.empty(int(counts.sum()), np.int32)
+        records = np.empty(len(entries) if len(lists.records) else 0, np.int64)
+        _merge_lists(
+            self._slab_starts,
+            self._slab_stops,
+            self._lists.entries,
+            self._depths,
+            lists.starts,
+            lists.stops,
+            lists.entries,
+            view.features,
+            lists.records,
+            self._frozen_count,
+            stops - counts,
+            entries,
+            records,
+        )
+        return TileLists(lists.tiles, stops - counts, stops, entries, lists.counts, records)
+
+
+@dataclass(frozen=True)
+class RegionTrace:
+    """The way back from a rendering of a region."""
+
+    region: Region
+    rendering: int  # which of the region's renderings
+    traced: cpu.Trace
+
+    def backward(self, gradients: PictureGradients) -> Gradients:
+        """The gradient with respect to the active Gaussians.
+
+        Raises
+        ------
+        RuntimeError
+            If the region has been rendered again: its rows are those of the later rendering.
+        """
+        if self.region._renderings != self.rendering:
+            raise RuntimeError("backward: the region has been rendered again since")
+        return self.traced.backward(gradients)
+
+
+@exact_kernel
+def _find_slabs(depths, starts, stops, near, far, slab_starts, slab_stops):
+    """Of each slot's entries, which are in order of depth: the first not before `near`, the first behind `far`."""
+    for s in range(len(starts)):
+        entry = starts[s]
+        while entry < stops[s] and depths[entry] < near[s]:
+            entry += 1
+        slab_starts[s] = entry
+        while entry < stops[s] and depths[entry] <= far[s]:
+            entry += 1
+        slab_stops[s] = entry
+
+
+@exact_kernel
+def _merge_lists(
+    a_starts, a_stops, a_entries, a_depths, b_starts, b_stops, b_entries, b_features, b_records, offset, starts,
+    entries, records,
+):  # fmt: skip
+    for s in range(len(starts)):
+        a, b = a_starts[s], b_starts[s]
+        for place in range(starts[s], starts[s] + a_stops[s] - a + b_stops[s] - b):
+            in_front = a < a_stops[s] and (b == b_stops[s] or a_depths[a] <= b_features[b_entries[b], DEPTH])
+            if in_front:
+                entries[place] = a_entries[a]
+                a += 1
+            else:
+                entries[place] = offset + b_entries[b]
+                if len(records):
+                    records[place] = b_records[b]
+                b += 1
