@@ -27,7 +27,20 @@ from .project import (
     WHITEN_YY,
     ZERO,
 )
-from .vec16 import floor16, fma16, load1, lowest_bit, max16, min16, prefetch, ramp16, spans_to_bits, splat16, sqrt16, where_greater
+from .vec16 import (
+    floor16,
+    fma16,
+    load1,
+    lowest_bit,
+    max16,
+    min16,
+    prefetch,
+    ramp16,
+    spans_to_bits,
+    splat16,
+    sqrt16,
+    where_greater,
+)
 
 AHEAD = 16  # rows to prefetch: in depth order each is a cache miss
 CELLS = 8  # a mask has a bit for each of 8×8 cells
@@ -46,8 +59,8 @@ class TileLists:
     starts: np.ndarray  # [S] int64
     stops: np.ndarray  # [S] int64
     entries: np.ndarray  # [P] int32, rows of features
-    counts: np.ndarray  # [N] int32, tiles that each Gaussian is in; empty if records were not asked for
-    records: np.ndarray  # [P] int64, each entry's own row for sums: a Gaussian's are consecutive
+    records: np.ndarray  # [P] int64, each entry's own row for sums, or empty if they were not asked for
+    spans: np.ndarray  # [N, 2] int64: a Gaussian's rows for sums are spans[g, 0] … spans[g, 1] − 1; or empty
 
 
 def tile_lists(
@@ -61,25 +74,27 @@ def tile_lists(
     order = depth_order(features, states)
     tiles = np.flatnonzero(slots.ravel() >= 0).astype(np.int32)
     bounds = _chunks(len(order))
-    counts = np.zeros((len(bounds) - 1, len(tiles)), np.int64)
-    per_row = np.zeros(len(states) if with_records else 0, np.int32)
-    next_record, records, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int32)
+    chunks = range(len(bounds) - 1)
+    places = np.zeros((len(chunks), len(tiles)), np.int64)
+    ordered = np.empty(len(order), np.int64)
+    spans = np.zeros((len(states) if with_records else 0, 2), np.int64)
+    packed = rects.view(np.int64).ravel()
 
-    def deal(k: int) -> None:
-        places = counts[k]
-        _deal(bounds[k], bounds[k + 1], order, features, rects, slots, places, entries, per_row, next_record, records)
+    def deal(k: int, entries: np.ndarray, record: int, records: np.ndarray) -> int:
+        part = bounds[k], bounds[k + 1], order, features, packed, ordered, slots, places[k]
+        return _deal(*part, entries, record, records, spans)
 
-    parallel_map(deal, range(len(bounds) - 1))
-    ends = np.cumsum(counts.T).reshape(counts.T.shape)  # tile by tile, and in a tile chunk by chunk
-    counts = np.ascontiguousarray(ends.T) - counts  # from here on: where each chunk writes its next entry
+    none, no_records = np.empty(0, np.int32), np.empty(0, np.int64)
+    counts = parallel_map(lambda k: deal(k, none, 0, no_records), chunks)
+    ends = np.cumsum(places.T).reshape(places.T.shape)  # tile by tile, and in a tile chunk by chunk
+    places = np.ascontiguousarray(ends.T) - places
     starts = np.zeros(len(tiles) + 1, np.int64)
     starts[1:] = ends[:, -1]
+    entries, records = np.empty(starts[-1], np.int32), np.empty(starts[-1] if with_records else 0, np.int64)
     if starts[-1]:
-        entries = np.empty(starts[-1], np.int32)
-        if with_records:
-            records, next_record = np.empty(starts[-1], np.int64), np.cumsum(per_row, dtype=np.int64) - per_row
-        parallel_map(deal, range(len(bounds) - 1))
-    return TileLists(tiles, starts[:-1], starts[1:], entries, per_row, records)
+        first = np.cumsum([0, *counts])
+        parallel_map(lambda k: deal(k, entries, first[k], records), chunks)
+    return TileLists(tiles, starts[:-1], starts[1:], entries, records, spans)
 
 
 def _chunks(count: int) -> list[int]:
@@ -117,9 +132,7 @@ def depth_order(
         width = -(-bits // passes)
         counts = np.zeros((len(bounds) - 1, 1 << width), np.int32)
         a, b = p % 2, 1 - p % 2
-        parallel_map(
-            lambda k: _count_digits(bounds[k], bounds[k + 1], keys[a], lowest, p * width, counts[k]), chunks
-        )
+        parallel_map(lambda k: _count_digits(bounds[k], bounds[k + 1], keys[a], lowest, p * width, counts[k]), chunks)
         ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
         places = np.ascontiguousarray(ends.T) - counts
         parallel_map(
@@ -195,18 +208,21 @@ def cover_mask(flat, o, left, top, cell):
 
 
 @exact_kernel
-def _deal(lo, hi, order, features, rects, slots, places, entries, per_row, next_record, records):
-    """Count the entries of each slot in `places`, or, when there is room for them, write them there."""
+def _deal(lo, hi, order, features, rects, ordered, slots, places, entries, record, records, spans):
+    """Count the entries of each slot in `places`, or, when there is room for them, write them there.
+
+    The first pass leaves the rectangles in order of depth, for the second. Returns one past the last record.
+    """
     flat, width = features.reshape(-1), features.shape[1]
-    flat_rects = rects.reshape(-1)
+    counting, recording = len(entries) == 0, len(spans) > 0
     for k in range(lo, hi):
         g = order[k]
-        prefetch(flat_rects, int64(order[min(k + 2 * AHEAD, hi - 1)]) * 4)
-        ahead = int64(order[min(k + AHEAD, hi - 1)])
-        if rects[ahead, 2] - rects[ahead, 0] > 1 and rects[ahead, 3] - rects[ahead, 1] > 1:
-            prefetch(flat, ahead * width)
-        n = next_record[g] if len(records) else 0
-        x0, y0, x1, y1 = rects[g, 0], rects[g, 1], rects[g, 2], rects[g, 3]
+        if counting:
+            prefetch(rects, int64(order[min(k + AHEAD, hi - 1)]))
+            ordered[k] = rects[g]
+        rect = ordered[k]
+        x0, y0, x1, y1 = rect & 0xFFFF, (rect >> 16) & 0xFFFF, (rect >> 32) & 0xFFFF, (rect >> 48) & 0xFFFF
+        first = record
         # of one row or column of tiles the bound reaches every one
         exact = x1 - x0 > 1 and y1 - y0 > 1
         for top in range(y0, y1, CELLS):
@@ -222,10 +238,11 @@ def _deal(lo, hi, order, features, rects, slots, places, entries, per_row, next_
                     if slot >= 0:
                         place = places[slot]
                         places[slot] = place + 1
-                        if len(entries):
+                        if not counting:
                             entries[place] = g
-                        if len(records):
-                            records[place] = n
-                        n += 1
-        if len(per_row) and not len(entries):
-            per_row[g] = n
+                            if recording:
+                                records[place] = record
+                        record += 1
+        if recording and not counting:
+            spans[g, 0], spans[g, 1] = first, record
+    return record

@@ -8,7 +8,7 @@ through which less than `stop` of the light passes are closed; blocks and tiles 
 from __future__ import annotations
 
 import numpy as np
-from numba import boolean, float32, int64, uint64
+from numba import float32, int64, uint64
 
 from ..jit import exact_kernel, inline_kernel
 from .bin import ONE, cover_mask
@@ -23,7 +23,6 @@ from .project import (
     DEPTH,
     GREEN,
     HALF,
-    HALF_LOG2E,
     LOG2_OPACITY,
     NORMAL_X,
     NORMAL_Y,
@@ -56,7 +55,6 @@ from .vec16 import (
     sqrt16,
     store16,
     sum16,
-    where_equal,
     where_greater,
 )
 
@@ -463,13 +461,18 @@ def weigh_range(
                 b = lowest_bit(mask)
                 mask &= mask - uint64(1)
                 k = b * WEIGHT_STATE
-                x, y = float32(left) + HALF + BLOCK_PX * float32(b & 7), float32(top) + HALF + BLOCK_PX * float32(b >> 3)
+                x, y = (
+                    float32(left) + HALF + BLOCK_PX * float32(b & 7),
+                    float32(top) + HALF + BLOCK_PX * float32(b >> 3),
+                )
                 if surfels:
                     dx, dy = column + (x - load1(flat, o + CENTRE_X)), row + (y - load1(flat, o + CENTRE_Y))
                     u = fma16(dx, load1(flat, o + U_X), dy * load1(flat, o + U_Y))
                     v = fma16(dx, load1(flat, o + V_X), dy * load1(flat, o + V_Y))
                     den = fma16(dx, load1(flat, o + A_X), fma16(dy, load1(flat, o + A_Y), one))
-                    _, alpha, _, _ = surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max)
+                    _, alpha, _, _ = surfel_alpha(
+                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
+                    )
                 else:
                     dx, dy = column + (x - load1(flat, o + BOUND_X)), row + (y - load1(flat, o + BOUND_Y))
                     along = fma16(dx, load1(flat, o + WHITEN_XX), dy * load1(flat, o + WHITEN_XY))

@@ -12,7 +12,7 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..threads import parallel_map, run_ranges, thread_count
 from .bin import TileLists, tile_lists
-from .blend import BLOCKS, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .blend import CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
 from .project import (
     BLUE,
     DEPTH,
@@ -182,9 +182,7 @@ def disparity_shifts(lists: TileLists, features: np.ndarray, settings: RasterSet
     return shifts
 
 
-def render(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
-) -> Rendering:
+def render(gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]) -> Rendering:
     return _draw(gaussians, camera, settings, passes, keep=False)[0]
 
 
@@ -266,10 +264,14 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
     gradients = [raw(getattr(given, f.name)) for f in fields(given)]
     check_gradients(given, traced.camera)
     flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
-    missing = [name for name, g, f in zip(("rgb", "expected_depth", "median_depth", "normals", "distortion"), flags, traced.flags) if g and not f]
+    missing = [
+        name
+        for name, g, f in zip(("rgb", "expected_depth", "median_depth", "normals", "distortion"), flags, traced.flags)
+        if g and not f
+    ]
     if missing:
         raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
-    records = aligned_rows(int(lists.counts.sum()), RECORD)
+    records = aligned_rows(len(lists.records), RECORD)
     over_tiles(
         unblend_range,
         lists,
@@ -317,8 +319,7 @@ def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
         bool(gaussians.antialiased),
         traced.view.features,
         traced.view.states,
-        lists.counts,
-        np.cumsum(lists.counts, dtype=np.int64) - lists.counts,
+        lists.spans,
         records.reshape(-1),
         out.means,
         out.log_scales,

@@ -192,7 +192,7 @@ def rotation(w, x, y, z):
 
 
 @inline_kernel
-def _load_quat(s, k):
+def load_quat(s, k):
     return load1(s, QW + k), load1(s, QX + k), load1(s, QY + k), load1(s, QZ + k)
 
 
@@ -214,7 +214,7 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         a0, a1, a2 = j00 * r00 + j02 * r20, j00 * r01 + j02 * r21, j00 * r02 + j02 * r22
         b0, b1, b2 = j11 * r10 + j12 * r20, j11 * r11 + j12 * r21, j11 * r12 + j12 * r22
 
-        qw, qx, qy, qz = _load_quat(s, k)
+        qw, qx, qy, qz = load_quat(s, k)
         q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
         s0, s1, s2 = exp64(load1(s, S0 + k)), exp64(load1(s, S1 + k)), exp64(load1(s, S2 + k))
         # The image covariance [[uu, uv], [uv, vv]] from u, v = rows of J R Q S. Its determinant is |u × v|²,
@@ -268,7 +268,7 @@ def _surfels(s, n, camera, low_pass, log2_alpha_min):
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     for k in range(n):
         x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
-        qw, qx, qy, qz = _load_quat(s, k)
+        qw, qx, qy, qz = load_quat(s, k)
         q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
         tx, ty, tz = (
             r00 * q00 + r01 * q10 + r02 * q20,
@@ -354,6 +354,20 @@ def _tile_range(low, high, tiles):
     return int64(first), int64(end)
 
 
+@inline_kernel
+def stage(s, n, i, means, log_scales, quats, opacity_logits, camera):
+    """Put Gaussian i into place n of the scratch planes, its mean in camera coordinates."""
+    x, y, z = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
+    store1(s, X + n, camera[0] * x + camera[1] * y + camera[2] * z + camera[9])
+    store1(s, Y + n, camera[3] * x + camera[4] * y + camera[5] * z + camera[10])
+    store1(s, Z + n, camera[6] * x + camera[7] * y + camera[8] * z + camera[11])
+    for k in range(4):
+        store1(s, QW + k * CHUNK + n, float64(quats[i, k]))
+    for k in range(log_scales.shape[1]):
+        store1(s, S0 + k * CHUNK + n, float64(log_scales[i, k]))
+    store1(s, LOGIT + n, float64(opacity_logits[i]))
+
+
 @exact_kernel
 def project_range(
     lo,
@@ -394,14 +408,7 @@ def project_range(
                 px, py, pz = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
                 z = camera[6] * px + camera[7] * py + camera[8] * pz + camera[11]
                 if near <= z < FAR and opacity_logits[i] > logit_min:
-                    store1(s, X + n, camera[0] * px + camera[1] * py + camera[2] * pz + camera[9])
-                    store1(s, Y + n, camera[3] * px + camera[4] * py + camera[5] * pz + camera[10])
-                    store1(s, Z + n, z)
-                    for k in range(4):
-                        store1(s, QW + k * CHUNK + n, float64(quats[i, k]))
-                    for k in range(log_scales.shape[1]):
-                        store1(s, S0 + k * CHUNK + n, float64(log_scales[i, k]))
-                    store1(s, LOGIT + n, float64(opacity_logits[i]))
+                    stage(s, n, i, means, log_scales, quats, opacity_logits, camera)
                     rows[n] = i
                     n += 1
             i += 1

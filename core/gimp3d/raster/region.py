@@ -180,7 +180,7 @@ class Region:
             entries,
             records,
         )
-        return TileLists(lists.tiles, stops - counts, stops, entries, lists.counts, records)
+        return TileLists(lists.tiles, stops - counts, stops, entries, records, lists.spans)
 
 
 @dataclass(frozen=True)

@@ -267,9 +267,7 @@ def spans_to_bits(typing: Any, first: Any, end: Any) -> Any:
     """A 64-bit mask: in byte k the bits first_k … end_k − 1, for lanes 0–7 of integers within 0 … 8."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        low, high = (
-            builder.shl(_integers(1), builder.fptosi(v, INTEGERS)) for v in args
-        )
+        low, high = (builder.shl(_integers(1), builder.fptosi(v, INTEGERS)) for v in args)
         span = builder.select(builder.icmp_signed(">", high, low), builder.sub(high, low), _integers(0))
         low_half = _shuffle(builder, span, span, list(range(8)))
         return builder.bitcast(builder.trunc(low_half, ir.VectorType(ir.IntType(8), 8)), I64)
