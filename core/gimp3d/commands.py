@@ -20,7 +20,7 @@ from .errors import BadInput
 from .io.cameras import read_cameras, write_transforms
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, read_ply, write_gaussians, write_ply
-from .jit import first_run
+from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
 from .orbit import orbit_cameras
 from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, remove_object, render_bytes
@@ -107,7 +107,7 @@ def render_views(
         raise BadInput("render: --background takes three numbers from 0 to 1")
     gaussians = read_ply(scene).gaussians
     chosen = select_cameras(read_cameras(cameras), split, frames)
-    _announce_first_run(progress)
+    announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
     for done, camera in enumerate(chosen, 1):
         drawn = render(gaussians, undistorted(camera).scaled(scale), raster, frozenset(passes))
@@ -141,7 +141,7 @@ def write_masks(
     written = [undistorted(c) for c in select_cameras(available, split, frames)]
     names = {c.id for c in written}
     others = [undistorted(c) for c in available if c.split == "train" and c.id not in names]
-    _announce_first_run(progress)
+    announce_compilation(lambda text: progress("compile", 0, 1, text))
     found = find_masks(gaussians, region, [*written, *others], MaskSettings(mode=mode), progress)
     targets = {v.camera.id: v.target for v in found.views}
     for camera in written:
@@ -183,7 +183,7 @@ def run_removal(
     region = read_region(Path(job.roi))
     cameras = _removal_cameras(job)
     warnings = list(_scene_warnings(file))
-    _announce_first_run(progress)
+    announce_compilation(lambda text: progress("compile", 0, 1, text))
     views, rendered = _load_views(cameras, job, file)
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
@@ -366,8 +366,3 @@ def _use_threads(threads: int | None) -> None:
     if threads is not None and threads < 1:
         raise BadInput(f"--threads must be 1 or more, got {threads}")
     set_thread_count(threads)
-
-
-def _announce_first_run(progress: Progress) -> None:
-    if first_run:
-        progress("compile", 0, 1, "first run on this machine: compiling kernels, some seconds")

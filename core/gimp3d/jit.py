@@ -8,8 +8,10 @@ Kernels therefore take constants from their own file or as arguments.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -38,7 +40,7 @@ def _source_hash() -> str:
 
 
 kernel_cache = user_cache_folder() / f"kernels-{_source_hash()}"
-first_run = not kernel_cache.exists()  # the first call compiles (some seconds): the pipeline says so
+_to_announce = not kernel_cache.exists()
 numba.config.CACHE_DIR = str(kernel_cache)
 
 kernel = numba.njit(nogil=True, cache=True, fastmath=True, error_model="numpy", boundscheck=False)
@@ -46,3 +48,11 @@ kernel = numba.njit(nogil=True, cache=True, fastmath=True, error_model="numpy", 
 exact_kernel = numba.njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy", boundscheck=False)
 # For small functions used inside kernels:
 inline_kernel = numba.njit(nogil=True, fastmath=True, error_model="numpy", boundscheck=False, inline="always")
+
+
+def announce_compilation(say: Callable[[str], object] = logging.getLogger("gimp3d").warning) -> None:
+    """Say once, and only where nothing is compiled yet, why the first call takes long."""
+    global _to_announce
+    if _to_announce:
+        _to_announce = False
+        say("first run on this machine: compiling kernels, up to 15 seconds")

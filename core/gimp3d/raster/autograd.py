@@ -10,7 +10,7 @@ import torch
 
 from ..camera import Camera
 from ..gaussians import Gaussians
-from . import ALL_PASSES, PictureGradients, RasterSettings, Region, trace
+from . import ALL_PASSES, PictureGradients, PixelRegion, RasterSettings, trace
 
 PICTURES = ("rgb", "alpha", "expected_depth", "median_depth", "normals", "distortion")
 
@@ -33,7 +33,7 @@ def rasterize(
     quats: torch.Tensor,  # [N, 4] wxyz
     opacity_logits: torch.Tensor,  # [N]
     sh: torch.Tensor,  # [N, K, 3]
-    view: Camera | Region,
+    view: Camera | PixelRegion,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
     antialiased: bool = False,
@@ -46,7 +46,7 @@ def rasterize(
         Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
         forward and backward: torch checks that.
     view
-        A camera; or a region, whose own settings and passes then count, and whose frozen Gaussians are drawn along.
+        A camera; or a pixel region, whose own settings and passes then count, and whose frozen Gaussians are drawn along.
 
     Raises
     ------
@@ -58,18 +58,19 @@ def rasterize(
         if t.dtype != torch.float32 or t.device.type != "cpu" or not t.is_contiguous():
             raise ValueError(f"{name}: expected a contiguous float32 tensor on the CPU, got {t.dtype} on {t.device}")
     drawn = _Rasterize.apply(*tensors, view, settings, passes, antialiased)
-    return Pictures(*(picture if picture.numel() else None for picture in drawn))
+    return Pictures(*(picture if picture.numel() else None for picture in drawn))  # type: ignore[arg-type]
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor, ...]:
         *tensors, view, settings, passes, antialiased = args
-        gaussians = Gaussians(*(t.detach().numpy() for t in tensors), antialiased)  # type: ignore[misc]
-        if isinstance(view, Region):
-            rendering, ctx.traced = view.trace(gaussians)
-        else:
+        means, log_scales, quats, opacity_logits, sh = (t.detach().numpy() for t in tensors)
+        gaussians = Gaussians(means, log_scales, quats, opacity_logits, sh, antialiased)
+        if isinstance(view, Camera):
             rendering, ctx.traced = trace(gaussians, view, settings, passes)
+        else:
+            rendering, ctx.traced = view.trace(gaussians)
         ctx.save_for_backward(*tensors)  # so that torch notices if they are changed in place
         ctx.set_materialize_grads(False)
         return tuple(torch.from_numpy(getattr(rendering, name)) for name in PICTURES)

@@ -9,6 +9,7 @@ import numpy as np
 from ..camera import Camera
 from ..gaussians import Gaussians
 from . import cpu
+from .region import CpuPixelRegion
 from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering
 
 
@@ -16,6 +17,18 @@ class Trace(Protocol):
     """What a backend keeps of a rendering for the way back."""
 
     def backward(self, gradients: PictureGradients) -> Gradients: ...
+
+
+class PixelRegion(Protocol):
+    """A part of a view where some Gaussians change and the rest does not; see `pixel_region`."""
+
+    def render(self, active: Gaussians) -> Rendering:
+        """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
+        ...
+
+    def trace(self, active: Gaussians) -> tuple[Rendering, Trace]:
+        """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
+        ...
 
 
 class Backend(Protocol):
@@ -29,6 +42,15 @@ class Backend(Protocol):
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
     ) -> tuple[Rendering, Trace]: ...
 
+    def pixel_region(
+        self,
+        frozen: Gaussians,
+        camera: Camera,
+        pixels: np.ndarray,
+        settings: RasterSettings,
+        passes: frozenset[str],
+    ) -> PixelRegion: ...
+
     def footprint(
         self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
     ) -> np.ndarray: ...
@@ -38,8 +60,17 @@ class Backend(Protocol):
     ) -> Contributions: ...
 
 
-CPU: Backend = cpu
-_current: Backend = CPU
+class CpuBackend:
+    """This machine's cores."""
+
+    render = staticmethod(cpu.render)
+    trace = staticmethod(cpu.trace)
+    pixel_region = staticmethod(CpuPixelRegion)
+    footprint = staticmethod(cpu.footprint)
+    contributions = staticmethod(cpu.contributions)
+
+
+_current: Backend = CpuBackend()
 
 
 def current_backend() -> Backend:

@@ -123,25 +123,29 @@ def depth_order(
     )
     if not total:
         return rows[0]
-    bounds = _chunks(total)
-    chunks = range(len(bounds) - 1)
     lowest = int(keys[0].min())
     bits = (int(keys[0].max()) - lowest).bit_length()
     passes = -(-bits // MOST_DIGIT_BITS)
     for p in range(passes):
-        width = -(-bits // passes)
-        counts = np.zeros((len(bounds) - 1, 1 << width), np.int32)
         a, b = p % 2, 1 - p % 2
-        parallel_map(lambda k: _count_digits(bounds[k], bounds[k + 1], keys[a], lowest, p * width, counts[k]), chunks)
-        ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
-        places = np.ascontiguousarray(ends.T) - counts
-        parallel_map(
-            lambda k: _scatter_digits(
-                bounds[k], bounds[k + 1], keys[a], rows[a], lowest, p * width, places[k], keys[b], rows[b]
-            ),
-            chunks,
-        )
+        _sort_by_digit(keys[a], rows[a], lowest, p * -(-bits // passes), -(-bits // passes), keys[b], rows[b])
     return rows[passes % 2]
+
+
+def _sort_by_digit(
+    keys: np.ndarray, rows: np.ndarray, lowest: int, shift: int, width: int, keys_out: np.ndarray, rows_out: np.ndarray
+) -> None:
+    """A stable counting sort by `width` bits of the keys, each chunk of them on its own thread."""
+    bounds = _chunks(len(keys))
+    chunks = range(len(bounds) - 1)
+    counts = np.zeros((len(chunks), 1 << width), np.int32)
+    parallel_map(lambda k: _count_digits(bounds[k], bounds[k + 1], keys, lowest, shift, counts[k]), chunks)
+    ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
+    places = np.ascontiguousarray(ends.T) - counts
+    parallel_map(
+        lambda k: _scatter_digits(bounds[k], bounds[k + 1], keys, rows, lowest, shift, places[k], keys_out, rows_out),
+        chunks,
+    )
 
 
 @exact_kernel

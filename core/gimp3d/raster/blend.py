@@ -214,7 +214,8 @@ def blend_range(
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state = states[slot] if len(states) else own_state
         if len(front):
-            state[:] = front[slot]
+            for k in range(0, TILE_STATE, 16):
+                store16(state, k, load16(front[slot], k))
         else:
             for b in range(BLOCKS):
                 for plane in range(PLANES):

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import Gaussians
+from ..jit import announce_compilation
 from ..threads import parallel_map, run_ranges, thread_count
 from .bin import TileLists, tile_lists
 from .blend import CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
@@ -51,6 +52,7 @@ def project(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, out: View | None = None
 ) -> View:
     """Feature rows of the Gaussians that reach the picture; into `out` where it is given."""
+    announce_compilation()
     n = len(gaussians)
     if out is None:
         features = aligned_rows(n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW)
@@ -140,6 +142,11 @@ def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.zeros((*(size if w else (0, 0)), *c), np.float32) for w, c in zip(wanted, channels))
 
 
+def as_rendering(pictures: tuple[np.ndarray, ...], ignored: int) -> Rendering:
+    rgb, alpha, expected, median, normals, distortion = pictures
+    return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
+
+
 def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
     across, down = tile_grid(camera)
@@ -201,7 +208,7 @@ def _draw(
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = disparity_shifts(lists, view.features, settings)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
-    return Rendering(*pictures, view.ignored), kept
+    return as_rendering(pictures, view.ignored), kept
 
 
 def blend(

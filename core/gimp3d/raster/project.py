@@ -72,8 +72,9 @@ TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
 # Scratch planes of a chunk: what is staged, then what comes out of it
 CHUNK = 64
 X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, LOGIT = range(0, 11 * CHUNK, CHUNK)  # camera coordinates of the centre
-(OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2, OUT_NX, OUT_NY, OUT_NZ,
- OUT_CENTRE_X, OUT_CENTRE_Y, OUT_UX, OUT_UY, OUT_VX, OUT_VY, OUT_AX, OUT_AY) = range(11 * CHUNK, 30 * CHUNK, CHUNK)  # fmt: skip
+OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2 = range(11 * CHUNK, 19 * CHUNK, CHUNK)
+OUT_NX, OUT_NY, OUT_NZ = range(19 * CHUNK, 22 * CHUNK, CHUNK)
+OUT_CENTRE_X, OUT_CENTRE_Y, OUT_UX, OUT_UY, OUT_VX, OUT_VY, OUT_AX, OUT_AY = range(22 * CHUNK, 30 * CHUNK, CHUNK)
 PLANES = 30
 SH_X, SH_Y, SH_Z = 16 * CHUNK, 17 * CHUNK, 18 * CHUNK  # after 16 planes of the SH basis: the direction
 BASIS_PLANES = 19
@@ -81,7 +82,8 @@ BASIS_PLANES = 19
 
 @inline_kernel
 def exp64(x):
-    """e^x with a relative error of 1e-11 for |x| ≤ 700; it is clamped beyond."""
+    """e^x with a relative error of 1e-11 for |x| ≤ 700; it is clamped beyond. For exact kernels only: fast-math
+    would cancel ROUNDING."""
     x = min(max(x, -700.0), 700.0)
     shifted = x * LOG2E + ROUNDING
     r = x - (shifted - ROUNDING) * LN2

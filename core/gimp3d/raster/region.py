@@ -25,7 +25,7 @@ SLAB_MARGIN = 0.02  # of the depth: how far active Gaussians may move before lay
 WORTH_LAYERS = 0.5  # a tile gets layers if its slab holds fewer of its frozen entries than this
 
 
-class Region:
+class CpuPixelRegion:
     """Wanted pixels of a view over a frozen scene. Not for two threads at once.
 
     The layers need no median depth: with the pass `depth`, everything in the tiles is blended every time.
@@ -36,8 +36,8 @@ class Region:
         frozen: Gaussians,
         camera: Camera,
         pixels: np.ndarray,  # [H, W] bool: 4×4 blocks around them are drawn, the rest of the pictures is 0
-        settings: RasterSettings = RasterSettings(),
-        passes: frozenset[str] = frozenset({"rgb", "alpha"}),
+        settings: RasterSettings,
+        passes: frozenset[str],
     ) -> None:
         if pixels.shape != (camera.height, camera.width):
             raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
@@ -100,7 +100,7 @@ class Region:
             self._front,
             self._back,
         )
-        return Rendering(*pictures, self._ignored + view.ignored), RegionTrace(self, self._renderings, kept)
+        return cpu.as_rendering(pictures, self._ignored + view.ignored), RegionTrace(self, self._renderings, kept)
 
     def _project(self, active: Gaussians) -> cpu.View:
         """Project the active Gaussians into feature rows behind the frozen ones."""
@@ -187,7 +187,7 @@ class Region:
 class RegionTrace:
     """The way back from a rendering of a region."""
 
-    region: Region
+    region: CpuPixelRegion
     rendering: int  # which of the region's renderings
     traced: cpu.Trace
 

@@ -89,8 +89,8 @@ P_X, P_Y, P_XX, P_XY, P_YY = range(5, 10)
 D_U_X, D_U_Y, D_V_X, D_V_Y, D_A_X, D_A_Y, D_CENTRE_X, D_CENTRE_Y = range(5, 13)
 D_NORMAL_X, D_NORMAL_Y, D_NORMAL_Z = 13, 14, 15
 
-# Planes of a block on the way back: T, which is 0 until a closed pixel is opened again, what lies behind, now and at
-# the START; gradients with respect to the sums of the same name and the sum of weights; the median's gradient and entry.
+# Planes of a block on the way back: T, which is 0 until a closed pixel is opened again; what lies behind, now and at
+# the START; gradients with respect to the sums of the same name and the sum of weights; the median's, and its entry.
 BEHIND, G_W, G_R, G_G, G_B, G_Z, G_MEDIAN, MEDIAN_ENTRY, G_NX, G_NY, G_NZ, G_M1, G_M2, START = range(16, 15 * 16, 16)
 BACK_STATE = 15 * 16
 TWICE_LN2, TWO = np.float32(2 * LN2), np.float32(2)

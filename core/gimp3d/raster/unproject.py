@@ -1,6 +1,6 @@
 """The way back through projection: from the records of a Gaussian's list entries to the gradients of its values.
 
-Everything is computed anew in float64, on scratch planes as in project.py; p, U, V, A … are as in unblend.py and project.py.
+Everything is computed anew in float64, on scratch planes as in project.py; p, U, V, A … are as there and in unblend.py.
 """
 
 from __future__ import annotations
@@ -371,28 +371,21 @@ def _colours_back(s, n, rows, basis, bands, camera, flat_sh, features, flat_d_sh
         gz = C1 * _dot(flat_sh, o + 6, red, green, blue)
         if bands > 4:
             xx, yy, zz = x * x, y * y, z * z
-            h4, h5 = C2[0] * _dot(flat_sh, o + 12, red, green, blue), -C2[0] * _dot(flat_sh, o + 15, red, green, blue)
-            h6, h7 = (
-                TWO * C2[1] * _dot(flat_sh, o + 18, red, green, blue),
-                -C2[0] * _dot(flat_sh, o + 21, red, green, blue),
-            )
+            h4 = C2[0] * _dot(flat_sh, o + 12, red, green, blue)
+            h5 = -C2[0] * _dot(flat_sh, o + 15, red, green, blue)
+            h6 = TWO * C2[1] * _dot(flat_sh, o + 18, red, green, blue)
+            h7 = -C2[0] * _dot(flat_sh, o + 21, red, green, blue)
             h8 = TWO * C2[2] * _dot(flat_sh, o + 24, red, green, blue)
             gx += y * h4 - x * h6 + z * h7 + x * h8
             gy += x * h4 + z * h5 - y * h6 - y * h8
             gz += y * h5 + TWO * z * h6 + x * h7
             if bands > 9:
-                h9, h10 = (
-                    -C3[0] * _dot(flat_sh, o + 27, red, green, blue),
-                    C3[1] * _dot(flat_sh, o + 30, red, green, blue),
-                )
-                h11, h12 = (
-                    -C3[2] * _dot(flat_sh, o + 33, red, green, blue),
-                    C3[3] * _dot(flat_sh, o + 36, red, green, blue),
-                )
-                h13, h14 = (
-                    -C3[2] * _dot(flat_sh, o + 39, red, green, blue),
-                    C3[4] * _dot(flat_sh, o + 42, red, green, blue),
-                )
+                h9 = -C3[0] * _dot(flat_sh, o + 27, red, green, blue)
+                h10 = C3[1] * _dot(flat_sh, o + 30, red, green, blue)
+                h11 = -C3[2] * _dot(flat_sh, o + 33, red, green, blue)
+                h12 = C3[3] * _dot(flat_sh, o + 36, red, green, blue)
+                h13 = -C3[2] * _dot(flat_sh, o + 39, red, green, blue)
+                h14 = C3[4] * _dot(flat_sh, o + 42, red, green, blue)
                 h15 = -C3[0] * _dot(flat_sh, o + 45, red, green, blue)
                 gx += SIX * x * y * h9 + y * z * h10 - TWO * x * y * h11 - SIX * x * z * h12
                 gx += (FOUR * zz - THREE * xx - yy) * h13 + TWO * x * z * h14 + THREE * (xx - yy) * h15
