@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -31,8 +31,12 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(READY)
+bench: bench-raster
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
+
+# PROTOTYPE=folder: also against the rasteriser's first prototype
+bench-raster: $(READY)
+	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
