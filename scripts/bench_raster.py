@@ -36,7 +36,7 @@ from raster_report import draw_chart, markdown, shown
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.job import write_atomically
-from gimp3d.raster import PictureGradients, Region, backward, contributions, cpu, render, trace
+from gimp3d.raster import PictureGradients, backward, contributions, cpu, pixel_region, render, trace
 from gimp3d.raster.vec16 import fma16, splat16, store16
 from gimp3d.threads import available_cores, set_thread_count
 
@@ -253,7 +253,7 @@ def warm_up() -> None:
         draw_once(scene(500, surfels), view, gradients)
     gaussians = scene(500)
     contributions(gaussians, view)
-    _, traced = Region(gaussians, view, np.ones((36, 64), bool), passes=PASSES).trace(gaussians)
+    _, traced = pixel_region(gaussians, view, np.ones((36, 64), bool), passes=PASSES).trace(gaussians)
     traced.backward(gradients)
     scene.cache_clear()
 
@@ -373,7 +373,7 @@ def region(plan: Plan, threads: int, slab: bool) -> dict[str, Any]:
         for _ in range(5)
     ]
     watch = Watch()
-    here = Region(gaussians.take(~active), view, pixels, passes=PASSES)
+    here = pixel_region(gaussians.take(~active), view, pixels, passes=PASSES)
     moves = cycle(jittered)
 
     def iterate() -> list[tuple[float, float]]:

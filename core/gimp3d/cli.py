@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import signal
 import sys
@@ -12,6 +13,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
+
+# Before NumPy is imported: the kernels have a thread pool of their own, and OpenBLAS's threads, which spin while they
+# wait for its small products, cost as much processor time again.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from . import __version__
 from .errors import BadInput, Cancelled, Gimp3dError

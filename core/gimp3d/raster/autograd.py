@@ -46,7 +46,7 @@ def rasterize(
         Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
         forward and backward: torch checks that.
     view
-        A camera; or a pixel region, whose own settings and passes then count, and whose frozen Gaussians are drawn along.
+        A camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
 
     Raises
     ------
