@@ -54,6 +54,8 @@ from .vec16 import (
     splat16,
     sqrt16,
     store16,
+    store_block,
+    store_block3,
     sum16,
     where_greater,
 )
@@ -181,8 +183,7 @@ def blend_range(
     order,  # [S] slots in the order in which they are done
     tiles,  # [S]
     across,
-    width,
-    height,
+    width,  # of the pictures
     starts,  # [S] first entry of each slot
     stops,  # [S] one past the last
     entries,  # [P]
@@ -199,8 +200,8 @@ def blend_range(
     states,  # [S, TILE_STATE] out; [0, …] if the caller needs only the pictures
     background,  # [3]
     back,  # [S, TILE_STATE] what lies behind the entries, or empty
-    pictures,  # (rgb [H, W, 3], alpha, expected, median [H, W], normals [H, W, 3], distortion [H, W]) out; without
-    # pixels where not asked for, and if alpha has none, only the states are made
+    pictures,  # (rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H]) out: flat, W = width
+    # and H rounded up to whole blocks; empty where not asked for, and if alpha is empty, only the states are made
 ):
     """Blend the tiles of slots order[lo:hi]."""
     alpha_min, alpha_max, stop = limits[0], limits[1], limits[2]
@@ -302,7 +303,7 @@ def blend_range(
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
         if len(pictures[1]):
-            _finish(state, left, top, width, height, wanted[slot], first, entries, features, surfels, limits, flags,
+            _finish(state, left, top, width, wanted[slot], first, entries, features, surfels, limits, flags,
                     background, back, slot, pictures)  # fmt: skip
 
 
@@ -342,29 +343,41 @@ def total(state, back, slot, k, plane, clear):
 
 @inline_kernel
 def _finish(
-    state, left, top, width, height, wanted, first, entries, features, surfels, limits, flags, background, back, slot,
+    state, left, top, width, wanted, first, entries, features, surfels, limits, flags, background, back, slot,
     pictures,
 ):  # fmt: skip
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
     rgb, alpha, expected, median, normals, distortion = pictures
-    out = np.empty(9 * 16, np.float32)
+    depths = np.empty(16, np.float32)
     mask = wanted
     while mask:
         b = lowest_bit(mask)
         mask &= mask - uint64(1)
         k = b * BLOCK_STATE
+        u, v = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
+        o = v * width + u
         clear = load16(state, k + T) + load16(state, k + HELD)
         passing = clear
         if len(back):
             passing = clear * (load16(back[slot], k + T) + load16(back[slot], k + HELD))
         weight = ONE - passing
-        store16(out, 0, weight)
+        store_block(alpha, o, width, weight)
         if flags[0]:
-            for c in range(3):
-                store16(out, 16 + 16 * c, fma16(passing, background[c], total(state, back, slot, k, R + 16 * c, clear)))
+            red = fma16(passing, background[0], total(state, back, slot, k, R, clear))
+            green = fma16(passing, background[1], total(state, back, slot, k, G, clear))
+            blue = fma16(passing, background[2], total(state, back, slot, k, B, clear))
+            store_block3(rgb, 3 * o, 3 * width, red, green, blue)
         if flags[1]:
             z = total(state, back, slot, k, Z, clear)
-            store16(out, 64, where_greater(weight, NOTHING, z / max16(weight, NOTHING), ZERO))
+            store_block(expected, o, width, where_greater(weight, NOTHING, z / max16(weight, NOTHING), ZERO))
+        if flags[2]:
+            for lane in range(16):
+                number = int64(load1(state, k + MEDIAN + lane))
+                depths[lane] = ZERO
+                if number > 0:
+                    row = features[entries[first + number - 1]]
+                    depths[lane] = depth_at(row, u + lane % BLOCK, v + lane // BLOCK, surfels, limits)
+            store_block(median, o, width, load16(depths, 0))
         if flags[3]:
             nx, ny, nz = (
                 total(state, back, slot, k, NX, clear),
@@ -373,31 +386,10 @@ def _finish(
             )
             length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
             inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
-            store16(out, 80, nx * inverse)
-            store16(out, 96, ny * inverse)
-            store16(out, 112, nz * inverse)
+            store_block3(normals, 3 * o, 3 * width, nx * inverse, ny * inverse, nz * inverse)
         if flags[4]:
             m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
-            store16(out, 128, max16(weight * m2 - m1 * m1, ZERO))
-        u0, v0 = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
-        for y in range(min(BLOCK, height - v0)):
-            for x in range(min(BLOCK, width - u0)):
-                lane, u, v = 4 * y + x, u0 + x, v0 + y
-                alpha[v, u] = load1(out, lane)
-                if flags[0]:
-                    for c in range(3):
-                        rgb[v, u, c] = load1(out, 16 + 16 * c + lane)
-                if flags[1]:
-                    expected[v, u] = load1(out, 64 + lane)
-                if flags[2]:
-                    number = load1(state, k + MEDIAN + lane)
-                    if number > ZERO:
-                        median[v, u] = depth_at(features[entries[first + int64(number) - 1]], u, v, surfels, limits)
-                if flags[3]:
-                    for c in range(3):
-                        normals[v, u, c] = load1(out, 80 + 16 * c + lane)
-                if flags[4]:
-                    distortion[v, u] = load1(out, 128 + lane)
+            store_block(distortion, o, width, max16(weight * m2 - m1 * m1, ZERO))
 
 
 @inline_kernel
@@ -421,8 +413,7 @@ def weigh_range(
     order,
     tiles,
     across,
-    width,
-    height,
+    _width,
     starts,
     stops,
     entries,
@@ -437,6 +428,7 @@ def weigh_range(
     alpha_min, alpha_max, stop, near, disc = limits[0], limits[1], limits[2], limits[3], limits[4]
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
+    height, width = pixels.shape
     state, covers = aligned_empty(BLOCKS * WEIGHT_STATE), np.empty(CHECK, np.uint64)
     for j in range(lo, hi):
         slot = order[j]

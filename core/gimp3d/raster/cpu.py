@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 from ..jit import announce_compilation
 from ..threads import parallel_map, run_ranges, thread_count
 from .bin import TileLists, tile_lists
-from .blend import CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
 from .project import (
     BLUE,
     DEPTH,
@@ -32,7 +32,8 @@ from .unproject import unproject_range
 FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
-NO_PICTURES = tuple(np.empty((0, 0, *c), np.float32) for c in ((3,), (), (), (), (3,), ()))
+CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
+NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
 
 
 @dataclass(frozen=True)
@@ -134,16 +135,36 @@ def pack_limits(settings: RasterSettings) -> np.ndarray:
     return np.array(limits, np.float32)
 
 
+def padded_size(camera: Camera) -> tuple[int, int]:
+    """Height and width of the kernels' pictures: whole blocks."""
+    return -(-int(camera.height) // BLOCK) * BLOCK, -(-int(camera.width) // BLOCK) * BLOCK
+
+
 def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
-    """rgb, alpha, expected, median, normals, distortion: zeros where asked for, else without pixels."""
+    """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
     wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
-    channels = ((3,), (), (), (), (3,), ())
-    size = (int(camera.height), int(camera.width))
-    return tuple(np.zeros((*(size if w else (0, 0)), *c), np.float32) for w, c in zip(wanted, channels))
+    height, width = padded_size(camera)
+    return tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
 
 
-def as_rendering(pictures: tuple[np.ndarray, ...], ignored: int) -> Rendering:
-    rgb, alpha, expected, median, normals, distortion = pictures
+def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
+    """A picture as kernels read it: flat, of whole blocks; empty if it has no pixels."""
+    if not picture.size:
+        return np.empty(0, np.float32)
+    height, width = padded_size(camera)
+    missing = ((0, height - camera.height), (0, width - camera.width), (0, 0))[: picture.ndim]
+    return raw(np.pad(picture, missing) if missing[0][1] or missing[1][1] else picture).reshape(-1)
+
+
+def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
+    """The kernels' pictures without what pads them to whole blocks."""
+    height, width = padded_size(camera)
+    cut = []
+    for flat, channels in zip(pictures, CHANNELS):
+        picture = flat.reshape(height if len(flat) else 0, width if len(flat) else 0, channels)
+        picture = picture[: camera.height, : camera.width]
+        cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
+    rgb, alpha, expected, median, normals, distortion = cut
     return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
 
 
@@ -208,7 +229,7 @@ def _draw(
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = disparity_shifts(lists, view.features, settings)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
-    return as_rendering(pictures, view.ignored), kept
+    return as_rendering(pictures, camera, view.ignored), kept
 
 
 def blend(
@@ -268,8 +289,8 @@ def blend(
 
 def _backward(traced: Trace, given: PictureGradients) -> Gradients:
     lists, settings = traced.lists, traced.settings
-    gradients = [raw(getattr(given, f.name)) for f in fields(given)]
     check_gradients(given, traced.camera)
+    gradients = [padded(getattr(given, f.name), traced.camera) for f in fields(given)]
     flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
     missing = [
         name
@@ -352,7 +373,7 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     threads = thread_count()
     chunks = 1 if threads == 1 else min(6 * threads, max(threads, len(order) // 4))
     across, _ = tile_grid(camera)
-    shared = (lists.tiles, across, int(camera.width), int(camera.height), lists.starts, lists.stops, lists.entries)
+    shared = (lists.tiles, across, padded_size(camera)[1], lists.starts, lists.stops, lists.entries)
     parallel_map(
         lambda part: kernel_range(0, len(part), part, *shared, *args),
         [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)],
@@ -369,7 +390,7 @@ def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings
     black = replace(settings, background=(0.0, 0.0, 0.0))
     flags, shifts = pass_flags(frozenset({"rgb"})), np.zeros(len(wanted), np.float32)
     pictures, _ = blend(gaussians, view, camera, black, flags, view.features, lists, wanted, shifts, keep=False)
-    return np.ascontiguousarray(pictures[0][..., 0])
+    return np.ascontiguousarray(as_rendering(pictures, camera, view.ignored).rgb[..., 0])
 
 
 def contributions(

@@ -100,7 +100,9 @@ class CpuPixelRegion:
             self._front,
             self._back,
         )
-        return cpu.as_rendering(pictures, self._ignored + view.ignored), RegionTrace(self, self._renderings, kept)
+        return cpu.as_rendering(pictures, self.camera, self._ignored + view.ignored), RegionTrace(
+            self, self._renderings, kept
+        )
 
     def _project(self, active: Gaussians) -> cpu.View:
         """Project the active Gaussians into feature rows behind the frozen ones."""

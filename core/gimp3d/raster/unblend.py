@@ -68,13 +68,16 @@ from .vec16 import (
     fma16,
     load1,
     load16,
+    load_block,
+    load_block_x,
+    load_block_y,
+    load_block_z,
     lowest_bit,
     max16,
     prefetch,
     rows16,
     splat16,
     sqrt16,
-    store1,
     store16,
     sums16,
     where_equal,
@@ -103,8 +106,7 @@ def unblend_range(
     order,  # [S] slots in the order in which they are done
     tiles,  # [S]
     across,
-    width,
-    height,
+    width,  # of the pictures
     starts,  # [S]
     stops,  # [S]
     entries,  # [P]
@@ -120,7 +122,7 @@ def unblend_range(
     states,  # [S, TILE_STATE] what blend_range left
     background,  # [3]
     back,  # [S, TILE_STATE] or empty
-    gradients,  # (rgb, alpha, expected, median, normals, distortion), without pixels where not given
+    gradients,  # (rgb, alpha, expected, median, normals, distortion) flat as blend_range's pictures, empty if not given
     first_active,  # rows below are frozen: they get no record
     record_rows,  # [P] int64
     records,  # [Q · 16] out
@@ -137,7 +139,7 @@ def unblend_range(
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state, shift = states[slot], shifts[slot]
         first, end = starts[slot], stops[slot]
-        _prepare(state, work, wanted[slot], left, top, width, height, flags, background, back, slot, gradients)
+        _prepare(state, work, wanted[slot], left, top, width, flags, background, back, slot, gradients)
         for i in range(ends[slot], end):
             if entries[i] >= first_active:
                 store16(records, record_rows[i] * RECORD, none)
@@ -323,48 +325,33 @@ def _reopen(state, work, mask, entry):
 
 
 @inline_kernel
-def _prepare(state, work, mask, left, top, width, height, flags, background, back, slot, gradients):
+def _prepare(state, work, mask, left, top, width, flags, background, back, slot, gradients):
     """The pixels' gradients with respect to the sums over Gaussians, from those of the pictures."""
     d_rgb, d_alpha, d_expected, d_median, d_normals, d_distortion = gradients
-    given = np.zeros(9 * 16, np.float32)  # r, g, b, alpha, expected, nx, ny, nz, distortion
     while mask:
         b = lowest_bit(mask)
         mask &= mask - uint64(1)
         k, w = b * BLOCK_STATE, b * BACK_STATE
-        given[:] = ZERO
-        store16(work, w + G_MEDIAN, splat16(ZERO))
-        u0, v0 = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
-        for y in range(min(BLOCK, height - v0)):
-            for x in range(min(BLOCK, width - u0)):
-                lane, u, v = 4 * y + x, u0 + x, v0 + y
-                if flags[0]:
-                    for c in range(3):
-                        store1(given, 16 * c + lane, d_rgb[v, u, c])
-                if len(d_alpha):
-                    store1(given, 48 + lane, d_alpha[v, u])
-                if flags[1]:
-                    store1(given, 64 + lane, d_expected[v, u])
-                if flags[2]:
-                    store1(work, w + G_MEDIAN + lane, d_median[v, u])
-                if flags[3]:
-                    for c in range(3):
-                        store1(given, 80 + 16 * c + lane, d_normals[v, u, c])
-                if flags[4]:
-                    store1(given, 128 + lane, d_distortion[v, u])
+        o = (top + BLOCK * (b >> 3)) * width + left + BLOCK * (b & 7)
         clear = load16(state, k + T) + load16(state, k + HELD)
         passing = clear
         if len(back):
             passing = clear * (load16(back[slot], k + T) + load16(back[slot], k + HELD))
-        weight, g_w, g_z = ONE - passing, load16(given, 48), splat16(ZERO)
+        weight, g_w, g_z = ONE - passing, splat16(ZERO), splat16(ZERO)
+        if len(d_alpha):
+            g_w = load_block(d_alpha, o, width)
         behind = splat16(ZERO)  # what shows where no Gaussian is left
         if flags[0]:
-            for c in range(3):
-                g = load16(given, 16 * c)
-                store16(work, w + G_R + 16 * c, g)
-                behind = fma16(g, background[c], behind)
+            g_red = load_block_x(d_rgb, 3 * o, 3 * width)
+            g_green = load_block_y(d_rgb, 3 * o, 3 * width)
+            g_blue = load_block_z(d_rgb, 3 * o, 3 * width)
+            behind = fma16(g_red, background[0], fma16(g_green, background[1], g_blue * background[2]))
+            store16(work, w + G_R, g_red)
+            store16(work, w + G_G, g_green)
+            store16(work, w + G_B, g_blue)
         if flags[1]:
             enough = where_greater(weight, NOTHING, ONE / max16(weight, NOTHING), ZERO)
-            g_z = load16(given, 64) * enough
+            g_z = load_block(d_expected, o, width) * enough
             g_w = g_w - g_z * total(state, back, slot, k, Z, clear) * enough
             store16(work, w + G_Z, g_z)
         if flags[3]:
@@ -376,13 +363,15 @@ def _prepare(state, work, mask, left, top, width, height, flags, background, bac
             length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
             inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
             nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
-            g_x, g_y, g_n = load16(given, 80), load16(given, 96), load16(given, 112)
+            g_x = load_block_x(d_normals, 3 * o, 3 * width)
+            g_y = load_block_y(d_normals, 3 * o, 3 * width)
+            g_n = load_block_z(d_normals, 3 * o, 3 * width)
             along = fma16(g_x, nx, fma16(g_y, ny, g_n * nz))
             store16(work, w + G_NX, (g_x - along * nx) * inverse)
             store16(work, w + G_NY, (g_y - along * ny) * inverse)
             store16(work, w + G_NZ, (g_n - along * nz) * inverse)
         if flags[4]:
-            g = load16(given, 128)
+            g = load_block(d_distortion, o, width)
             m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
             store16(work, w + G_M1, ZERO - g * m1 * TWO)
             store16(work, w + G_M2, g * weight)
@@ -406,4 +395,6 @@ def _prepare(state, work, mask, left, top, width, height, flags, background, bac
         store16(work, w + BEHIND, behind)
         store16(work, w + START, behind)
         store16(work, w + T, load16(state, k + T))
-        store16(work, w + MEDIAN_ENTRY, load16(state, k + MEDIAN))
+        if flags[2]:
+            store16(work, w + G_MEDIAN, load_block(d_median, o, width))
+            store16(work, w + MEDIAN_ENTRY, load16(state, k + MEDIAN))

@@ -117,6 +117,63 @@ def store16(typing: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.int64, vec16), code
 
 
+def _row_pointer(context: Any, builder: Any, sig: Any, args: Any, row: int, kind: Any) -> Any:
+    """Where a block's row lies in an array; args: the array, an index and a stride."""
+    place = builder.add(args[1], builder.mul(args[2], I64(row)))
+    return _pointer(context, builder, sig.args[0], args[0], place, kind)
+
+
+@intrinsic
+def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+    """A block's 4 rows to array[index + row · stride : … + 4]."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        for row in range(4):
+            four = _shuffle(builder, args[3], args[3], list(range(4 * row, 4 * row + 4)))
+            builder.store(four, _row_pointer(context, builder, sig, args, row, four.type)).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, vec16), code
+
+
+@intrinsic
+def store_block3(typing: Any, array: Any, index: Any, stride: Any, x: Any, y: Any, z: Any) -> Any:
+    """A block's 4 rows of 4 triples (x, y, z) to array[index + row · stride : … + 12]."""
+
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        for row in range(4):
+            lanes = range(4 * row, 4 * row + 4)
+            pairs = _shuffle(builder, args[3], args[4], [v for k in lanes for v in (k, k + LANES)] + [0] * 8)
+            chosen = [v for n, k in enumerate(lanes) for v in (2 * n, 2 * n + 1, k + LANES)]
+            triples = _shuffle(builder, pairs, args[5], chosen)
+            builder.store(triples, _row_pointer(context, builder, sig, args, row, triples.type)).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, vec16, vec16, vec16), code
+
+
+def _block_loader(channels: int, channel: int) -> Any:
+    def typer(typing: Any, array: Any, index: Any, stride: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            kind = ir.VectorType(ir.FloatType(), 4 * channels)
+            rows = []
+            for row in range(4):
+                loaded = builder.load(_row_pointer(context, builder, sig, args, row, kind))
+                loaded.align = 4
+                rows.append(_shuffle(builder, loaded, loaded, list(range(channel, 4 * channels, channels))))
+            halves = [_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2)]
+            return _shuffle(builder, *halves, list(range(LANES)))
+
+        return vec16(array, types.int64, types.int64), code
+
+    return intrinsic(typer)
+
+
+# A block's 4 rows from array[index + row · stride : …]: 4 values each, or one channel of 4 triples.
+load_block = _block_loader(1, 0)
+load_block_x, load_block_y, load_block_z = (_block_loader(3, c) for c in range(3))
+
+
 @intrinsic
 def load1(typing: Any, array: Any, index: Any) -> Any:
     """array[index] without the wrap-around of negative indices, which would block vectorisation."""
