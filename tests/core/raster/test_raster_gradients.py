@@ -386,7 +386,7 @@ def test_giants_needles_and_points_get_finite_gradients(kind: str, logit: float,
         assert found.sh.any()
 
 
-@pytest.mark.parametrize("log_scale", [4.0, 10.0, 15.0, 40.0, 79.0])
+@pytest.mark.parametrize("log_scale", [4.0, 10.0, 15.0, 40.0, 60.0])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_needle_that_crosses_the_view_is_not_moved_by_its_ends(antialiased: bool, log_scale: float) -> None:
     """Once it is longer than the view its length hardly matters, and the other gradients stay what they are."""
