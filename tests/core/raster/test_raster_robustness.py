@@ -144,6 +144,14 @@ def test_a_long_needle_does_not_glow() -> None:
     np.testing.assert_allclose(render(needle, WIDE).alpha, alpha, atol=1e-4)
 
 
+@pytest.mark.parametrize("log_scale", [10.0, 30.0, 45.0, 60.0])
+def test_a_needle_longer_than_the_view_looks_the_same_however_long(log_scale: float) -> None:
+    """Its slant in its own whitened axes, ∝ its length, must not overflow where the blocks are found it reaches."""
+    needles = [one(scale=(np.exp(s), 0.02, 0.02), quat=(0.9, 0.1, 0.2, 0.4)) for s in (8.0, log_scale)]
+    short, long = (render(needle, CAMERA).alpha for needle in needles)
+    np.testing.assert_allclose(long, short, atol=1e-4)
+
+
 def test_a_splat_beside_the_camera_does_not_flood_the_view() -> None:
     """Its unclamped Jacobian would smear a splat 2 m to the side, barely in front, over every pixel."""
     assert render(one((2.0, 0.0, 0.02), 0.3), WIDE).alpha.max() == 0
