@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import float32, int64, uint64
+from numba import float32, float64, int64, uint64
 
 from ..jit import exact_kernel, inline_kernel
 from ..threads import parallel_map, thread_count
@@ -196,8 +196,8 @@ def cover_mask(flat, o, left, top, cell):
     low = max16(first_centre, -half_height)
     high = min16(first_centre + (cell - ONE), half_height)
     # the bound reaches furthest right at dy = tip and furthest left at dy = −tip
-    slope = float(xy) / float(yy)
-    tip = float32(-slope * float(radius) / (float(yy) * math.sqrt(1.0 + slope * slope)))
+    slope = float64(xy) / float64(yy)
+    tip = float32(-slope * float64(radius) / (float64(yy) * math.sqrt(1.0 + slope * slope)))
     right, left_dy = min16(max16(splat16(tip), low), high), min16(max16(splat16(-tip), low), high)
     down_right, down_left = right * yy, left_dy * yy
     reach_right = sqrt16(max16(radius * radius - down_right * down_right, ZERO)) - right * xy + SLACK * radius

@@ -208,27 +208,35 @@ def _ellipses_back(s, n, camera, low_pass, antialiased):
         px, py = _sum(s, P_X, k), _sum(s, P_Y, k)
         d_mean_x, d_mean_y = kxx * px + kxy * py, kxy * px + kyy * py
         pxx, pxy, pyy = _sum(s, P_XX, k), _sum(s, P_XY, k), _sum(s, P_YY, k)
-        t00, t01 = kxx * pxx + kxy * pxy, kxx * pxy + kxy * pyy
-        t10, t11 = kxy * pxx + kyy * pxy, kxy * pxy + kyy * pyy
-        d_xx, d_xy, d_yy = t00 * kxx + t01 * kxy, t00 * kxy + t01 * kyy, t10 * kxy + t11 * kyy
-        # dL/dV = 2 dL/dcov V
-        du0, dv0 = d_xx * u0 + d_xy * v0, d_xy * u0 + d_yy * v0
-        du1, dv1 = d_xx * u1 + d_xy * v1, d_xy * u1 + d_yy * v1
-        du2, dv2 = d_xx * u2 + d_xy * v2, d_xy * u2 + d_yy * v2
+        # K V = (low_pass V + [v × n; n × u]) / det: as a product, its terms would cancel for needles
+        ku0, kv0 = (low_pass * u0 + v1 * n2 - v2 * n1) / det, (low_pass * v0 + n1 * u2 - n2 * u1) / det
+        ku1, kv1 = (low_pass * u1 + v2 * n0 - v0 * n2) / det, (low_pass * v1 + n2 * u0 - n0 * u2) / det
+        ku2, kv2 = (low_pass * u2 + v0 * n1 - v1 * n0) / det, (low_pass * v2 + n0 * u1 - n1 * u0) / det
+        # dL/dV = 2 dL/dcov V = K (Σpδδᵀ) K V
+        tu0, tv0 = pxx * ku0 + pxy * kv0, pxy * ku0 + pyy * kv0
+        tu1, tv1 = pxx * ku1 + pxy * kv1, pxy * ku1 + pyy * kv1
+        tu2, tv2 = pxx * ku2 + pxy * kv2, pxy * ku2 + pyy * kv2
+        du0, dv0 = kxx * tu0 + kxy * tv0, kxy * tu0 + kyy * tv0
+        du1, dv1 = kxx * tu1 + kxy * tv1, kxy * tu1 + kyy * tv1
+        du2, dv2 = kxx * tu2 + kxy * tv2, kxy * tu2 + kyy * tv2
+        # dL/d ln s_k = u_k du_k + v_k dv_k, as column k of V is proportional to s_k; K is symmetric
+        d_s0, d_s1, d_s2 = ku0 * tu0 + kv0 * tv0, ku1 * tu1 + kv1 * tv1, ku2 * tu2 + kv2 * tv2
         if antialiased:  # ln opacity has ½ (ln sharp − ln det) added; d sharp / du = 2 v × n, d sharp / dv = 2 n × u
             p = _sum(s, LOG_ALPHA, k)
-            c = p * (1.0 / sharp - 1.0 / det) if sharp > 1e-300 else 0.0
-            low = p * low_pass / det
-            du0 += c * (v1 * n2 - v2 * n1) - low * u0
-            du1 += c * (v2 * n0 - v0 * n2) - low * u1
-            du2 += c * (v0 * n1 - v1 * n0) - low * u2
-            dv0 += c * (n1 * u2 - n2 * u1) - low * v0
-            dv1 += c * (n2 * u0 - n0 * u2) - low * v1
-            dv2 += c * (n0 * u1 - n1 * u0) - low * v2
-        # dL/d ln s_k = u_k du_k + v_k dv_k, as column k of V is proportional to s_k
-        store1(s, D_SCALE + k, u0 * du0 + v0 * dv0)
-        store1(s, D_SCALE + CHUNK + k, u1 * du1 + v1 * dv1)
-        store1(s, D_SCALE + 2 * CHUNK + k, u2 * du2 + v2 * dv2)
+            c = p / sharp if sharp > 1e-300 else 0.0
+            du0 += c * (v1 * n2 - v2 * n1) - p * ku0
+            du1 += c * (v2 * n0 - v0 * n2) - p * ku1
+            du2 += c * (v0 * n1 - v1 * n0) - p * ku2
+            dv0 += c * (n1 * u2 - n2 * u1) - p * kv0
+            dv1 += c * (n2 * u0 - n0 * u2) - p * kv1
+            dv2 += c * (n0 * u1 - n1 * u0) - p * kv2
+            h0, h1, h2 = n1 * n1 + n2 * n2, n0 * n0 + n2 * n2, n0 * n0 + n1 * n1  # half of d sharp / d ln s_k
+            d_s0 += c * h0 - p * (low_pass * (u0 * u0 + v0 * v0) + h0) / det
+            d_s1 += c * h1 - p * (low_pass * (u1 * u1 + v1 * v1) + h1) / det
+            d_s2 += c * h2 - p * (low_pass * (u2 * u2 + v2 * v2) + h2) / det
+        store1(s, D_SCALE + k, d_s0)
+        store1(s, D_SCALE + CHUNK + k, d_s1)
+        store1(s, D_SCALE + 2 * CHUNK + k, d_s2)
         du0, du1, du2, dv0, dv1, dv2 = du0 * s0, du1 * s1, du2 * s2, dv0 * s0, dv1 * s1, dv2 * s2
         e00, e01, e02 = a0 * du0 + b0 * dv0, a0 * du1 + b0 * dv1, a0 * du2 + b0 * dv2
         e10, e11, e12 = a1 * du0 + b1 * dv0, a1 * du1 + b1 * dv1, a1 * du2 + b1 * dv2

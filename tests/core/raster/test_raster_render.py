@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians, matrices_to_quats, quats_to_matrices
-from gimp3d.raster import ALL_PASSES, RasterSettings, render
+from gimp3d.raster import ALL_PASSES, PASSES, RasterSettings, render
 
 CAMERA = Camera("front", 41, 29, 35.0, 33.0, 20.5, 14.5, np.eye(4))
 LOGIT_09 = float(np.log(9.0))  # opacity 0.9
@@ -103,10 +103,6 @@ def test_antialiased_opacity_matches_the_reference() -> None:
     assert render(thin, CAMERA).alpha.sum() < render(gaussians, CAMERA).alpha.sum()
 
 
-def test_surfels_match_flat_gaussians() -> None:
-    assert_matches_reference(random_scene(9, surfels=True), CAMERA)
-
-
 def test_other_thresholds_match_the_reference() -> None:
     raster = RasterSettings((0.2, 0.4, 0.6), near=2.0, low_pass=1.5, alpha_min=1e-3, alpha_max=0.8)
     assert_matches_reference(random_scene(10), CAMERA, raster)
@@ -175,24 +171,39 @@ def test_colours_may_exceed_one_but_not_fall_below_zero() -> None:
     np.testing.assert_allclose(drawn, (3.0 * 0.99, 0.0, 0.5 * 0.99), rtol=1e-4)
 
 
-@pytest.mark.parametrize("wanted", [set(), {"rgb"}, {"alpha"}, {"depth"}, {"normal"}, {"alpha", "depth"}])
-def test_a_pass_is_the_same_alone_as_with_the_others(wanted: set[str]) -> None:
-    gaussians = random_scene(13)
-    everything, some = render(gaussians, CAMERA), render(gaussians, CAMERA, passes=frozenset(wanted))
-    pictures = {
-        "rgb": ["rgb"],
-        "depth": ["expected_depth", "median_depth"],
-        "normal": ["normals"],
+@pytest.mark.parametrize(
+    "wanted",
+    [set(), {"rgb"}, {"alpha"}, {"depth"}, {"expected_depth"}, {"normal"}, {"distortion"}, {"alpha", "depth"}],
+)
+@pytest.mark.parametrize("surfels", [False, True])
+def test_a_pass_is_the_same_alone_as_with_the_others(surfels: bool, wanted: set[str]) -> None:
+    gaussians = random_scene(13, surfels=surfels)
+    everything, some = render(gaussians, CAMERA, passes=PASSES), render(gaussians, CAMERA, passes=frozenset(wanted))
+    passes = {  # each picture's
+        "rgb": {"rgb"},
+        "expected_depth": {"depth", "expected_depth"},
+        "median_depth": {"depth"},
+        "normals": {"normal"},
+        "distortion": {"distortion"},
     }
     np.testing.assert_array_equal(some.alpha, everything.alpha)
-    for name, fields in pictures.items():
-        for field in fields:
-            if name in wanted:
-                np.testing.assert_array_equal(getattr(some, field), getattr(everything, field))
-            else:
-                assert getattr(some, field).size == 0
+    for field, names in passes.items():
+        if names & wanted:
+            np.testing.assert_array_equal(getattr(some, field), getattr(everything, field))
+        else:
+            assert getattr(some, field).size == 0
+        assert getattr(everything, field).any()
+
+
+def test_distortion_is_that_of_pairs_of_weights_and_depths() -> None:
+    """Two facing Gaussians on the optical axis: w₁ w₂ (n/z₁ − n/z₂)²."""
+    both = one((0, 0, 2.0), 0.3, 0.0).extended(one((0, 0, 5.0), 0.5, 0.0))
+    raster = RasterSettings(distortion_near=0.7)
+    drawn = render(both, CAMERA, raster, frozenset({"distortion"})).distortion[14, 20]
+    assert drawn == pytest.approx(0.5 * 0.25 * (0.7 / 2 - 0.7 / 5) ** 2, rel=1e-4)
+    assert render(both.take(np.array([0])), CAMERA, raster, PASSES).distortion.max() < 1e-8
 
 
 def test_an_unknown_pass_is_named() -> None:
-    with pytest.raises(ValueError, match=r"colour.*alpha.*depth.*normal.*rgb"):
+    with pytest.raises(ValueError, match=r"colour.*alpha.*depth.*distortion.*expected_depth.*normal.*rgb"):
         render(one(), CAMERA, passes=ALL_PASSES | {"colour"})

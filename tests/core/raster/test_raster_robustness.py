@@ -14,7 +14,19 @@ from test_raster_render import CAMERA, one, random_scene
 from gimp3d import threads
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians, quats_to_matrices
-from gimp3d.raster import Rendering, blend, contributions, footprint, project, render
+from gimp3d.raster import (
+    PASSES,
+    PictureGradients,
+    Rendering,
+    blend,
+    contributions,
+    footprint,
+    project,
+    render,
+    trace,
+    unblend,
+    unproject,
+)
 
 WIDE = Camera("wide", 160, 100, 130.0, 130.0, 80.0, 50.0, np.eye(4))
 ODD_VALUES = [0.0, -0.0, 1e-30, 1e10, -1e10, 3e38, -3e38, np.inf, -np.inf, np.nan, 79.0, 81.0, 1e-12]
@@ -62,7 +74,7 @@ def test_concurrent_and_nested_renders_are_bit_equal_to_single_ones() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_odd_rows_are_ignored_as_usable_says_and_harm_nothing(data: st.DataObject) -> None:
-    """Any value in any column: what is not `usable` is counted, and every picture stays finite."""
+    """Any value in any column: rows that are not `usable` are not drawn, and every picture stays finite."""
     surfels = data.draw(st.booleans())
     scene = random_scene(data.draw(st.integers(0, 99)), 20, 1, surfels)
     for _ in range(data.draw(st.integers(1, 6))):
@@ -71,13 +83,16 @@ def test_odd_rows_are_ignored_as_usable_says_and_harm_nothing(data: st.DataObjec
         row, entry = data.draw(st.integers(0, 19)), data.draw(st.integers(0, column.shape[1] - 1))
         column[row, entry] = data.draw(st.sampled_from(ODD_VALUES))
     with np.errstate(all="ignore"):
-        usable = scene.usable
-    drawn = render(scene, CAMERA)
-    assert drawn.ignored == np.count_nonzero(~usable)
-    without = render(scene.take(usable), CAMERA)
+        usable, intact = scene.usable, replace(scene, sh=np.zeros_like(scene.sh)).usable
+    drawn = render(scene, CAMERA, passes=PASSES)
+    # broken geometry counts always, a broken colour only where it would be seen
+    assert np.count_nonzero(~intact) <= drawn.ignored <= np.count_nonzero(~usable)
+    colourless = render(replace(scene, sh=np.zeros_like(scene.sh)), CAMERA)
+    assert colourless.ignored == np.count_nonzero(~intact)
+    without = render(scene.take(usable), CAMERA, passes=PASSES)
     assert without.ignored == 0
     assert_identical(arrays(drawn)[:-1], arrays(without)[:-1])
-    for picture in (drawn.alpha, drawn.expected_depth, drawn.median_depth, drawn.normals):
+    for picture in (drawn.alpha, drawn.expected_depth, drawn.median_depth, drawn.normals, drawn.distortion):
         assert np.isfinite(picture).all()
     assert not np.isnan(drawn.rgb).any()  # a colour of 3e38 may overflow to infinity
     assert (drawn.alpha >= 0).all() and (drawn.alpha <= 1).all()
@@ -88,11 +103,13 @@ def test_every_kind_of_unusable_row_is_counted() -> None:
     scene.means[0, 1] = np.nan
     scene.means[1, 2] = np.inf
     scene.quats[2] = 0
-    scene.sh[3, 15, 2] = np.nan
     scene.log_scales[4, 0] = np.nan
     scene.opacity_logits[5] = np.nan
-    assert render(scene, CAMERA).ignored == 6
-    assert render(scene, CAMERA, passes=frozenset({"alpha"})).ignored == 6
+    for z, ignored in ((2.0, 6), (-2.0, 5)):  # a broken colour counts in the picture, not behind the camera
+        scene.means[3] = (0, 0, z)
+        scene.sh[3, 15, 2] = np.nan
+        assert render(scene, CAMERA).ignored == ignored
+        assert render(scene, CAMERA, passes=frozenset({"alpha"})).ignored == ignored
 
 
 @pytest.mark.parametrize(("logit", "alpha"), [(np.inf, 0.99), (-np.inf, 0.0)])
@@ -125,6 +142,14 @@ def test_a_long_needle_does_not_glow() -> None:
     alpha = 0.9 * np.exp(-0.5 * (right_angle**2 / (0.3 + (26e-4) ** 2) + along**2 / (0.3 + 780.0**2)))
     alpha[alpha < 1 / 255] = 0
     np.testing.assert_allclose(render(needle, WIDE).alpha, alpha, atol=1e-4)
+
+
+@pytest.mark.parametrize("log_scale", [10.0, 30.0, 45.0, 60.0])
+def test_a_needle_longer_than_the_view_looks_the_same_however_long(log_scale: float) -> None:
+    """Its slant in its own whitened axes, ∝ its length, must not overflow where the blocks are found it reaches."""
+    needles = [one(scale=(np.exp(s), 0.02, 0.02), quat=(0.9, 0.1, 0.2, 0.4)) for s in (8.0, log_scale)]
+    short, long = (render(needle, CAMERA).alpha for needle in needles)
+    np.testing.assert_allclose(long, short, atol=1e-4)
 
 
 def test_a_splat_beside_the_camera_does_not_flood_the_view() -> None:
@@ -170,11 +195,23 @@ def test_a_picture_of_one_pixel() -> None:
     assert contributions(one(scale=0.5), camera).total[0] == pytest.approx(0.9, rel=1e-5)
 
 
+def draw_and_go_back(gaussians: Gaussians, camera: Camera) -> None:
+    render(gaussians, camera)
+    rendering, traced = trace(gaussians, camera)
+    traced.backward(PictureGradients(rgb=rendering.rgb[::-1], alpha=rendering.alpha.astype(np.float64)))
+
+
 def test_kernels_are_compiled_once_for_every_kind_of_input() -> None:
     """Read-only, strided or float64 arrays, surfels, every SH degree: a recompilation would take seconds."""
-    kernels = (project.project_range, blend.blend_range, blend.weigh_range)
+    kernels = (
+        project.project_range,
+        blend.blend_range,
+        blend.weigh_range,
+        unblend.unblend_range,
+        unproject.unproject_range,
+    )
     scene = random_scene(43, degree=1)
-    render(scene, CAMERA), contributions(scene, CAMERA)
+    draw_and_go_back(scene, CAMERA), contributions(scene, CAMERA)
     before = [len(k.signatures) for k in kernels]
     frozen = random_scene(43, degree=1)
     for array in (frozen.means, frozen.log_scales, frozen.quats, frozen.opacity_logits, frozen.sh):
@@ -184,6 +221,6 @@ def test_kernels_are_compiled_once_for_every_kind_of_input() -> None:
     odd += [random_scene(44, 10, degree) for degree in range(4)] + [random_scene(45, 10, surfels=True)]
     sized = replace(CAMERA, width=np.int32(41), height=np.int64(29))  # type: ignore[arg-type]
     for gaussians in odd:
-        render(gaussians, sized), contributions(gaussians, sized, pixels=np.ones((29, 41), np.uint8))
+        draw_and_go_back(gaussians, sized), contributions(gaussians, sized, pixels=np.ones((29, 41), np.uint8))
     assert [len(k.signatures) for k in kernels] == before
     assert_identical(arrays(render(frozen, CAMERA)), arrays(render(odd[1], CAMERA)))
