@@ -190,7 +190,7 @@ def blend_range(
     features,  # [N, 16 or 32]
     surfels,  # features are of surfels
     limits,  # [6] float32: alpha_min, alpha_max, stop, near, low-pass factor of surfels, distortion's near
-    shifts,  # [S] float32: what is taken from the distortion's disparities, against cancellation
+    shifts,  # [S] float32 > 0: depths (and their disparities) are summed less this one, against cancellation
     flags,  # [5] bool: with rgb, expected depth, median depth, normals, distortion
     wanted,  # [S] uint64: blocks to draw
     front,  # [S, TILE_STATE] what lies before the entries, or empty
@@ -223,6 +223,7 @@ def blend_range(
                     store16(state, b * BLOCK_STATE + 16 * plane, none)
                 store16(state, b * BLOCK_STATE + T, one)
         alive, shift = wanted[slot], shifts[slot]
+        disparity_shift = distortion_near / shift
         if len(front):
             alive = _open(state, alive, stop)
         first, end, i = starts[slot], stops[slot], starts[slot]
@@ -261,19 +262,19 @@ def blend_range(
                         _add_colour(state, k, weight, red, green, blue)
                     if with_depth:
                         z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
-                        store16(state, k + Z, fma16(weight, z, load16(state, k + Z)))
+                        store16(state, k + Z, fma16(weight, z - shift, load16(state, k + Z)))
                     if with_median:
                         _mark_median(state, k, before, after, number)
                     if with_normals:
                         _add_normal(state, k, weight, nx, ny, nz)
                     if with_distortion:
-                        m = where_greater(blurred, ZERO, one, den) * disparity - shift
+                        m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                         _add_disparity(state, k, weight, m)
             else:
                 x, y = float32(left) + HALF - load1(flat, o + BOUND_X), float32(top) + HALF - load1(flat, o + BOUND_Y)
                 xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
                 along0, down0 = fma16(column, xx, row * xy), row * yy
-                m = splat16(distortion_near / depth - shift)
+                m = splat16(distortion_near / depth - disparity_shift)
                 while mask:
                     b = lowest_bit(mask)
                     mask &= mask - uint64(1)
@@ -289,7 +290,7 @@ def blend_range(
                     if with_rgb:
                         _add_colour(state, k, weight, red, green, blue)
                     if with_depth:
-                        store16(state, k + Z, fma16(weight, depth, load16(state, k + Z)))
+                        store16(state, k + Z, fma16(weight, depth - shift, load16(state, k + Z)))
                     if with_median:
                         _mark_median(state, k, before, after, number)
                     if with_normals:
@@ -303,7 +304,7 @@ def blend_range(
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
         if len(pictures[1]):
-            _finish(state, left, top, width, wanted[slot], first, entries, features, surfels, limits, flags,
+            _finish(state, left, top, width, wanted[slot], shift, first, entries, features, surfels, limits, flags,
                     background, back, slot, pictures)  # fmt: skip
 
 
@@ -343,7 +344,7 @@ def total(state, back, slot, k, plane, clear):
 
 @inline_kernel
 def _finish(
-    state, left, top, width, wanted, first, entries, features, surfels, limits, flags, background, back, slot,
+    state, left, top, width, wanted, shift, first, entries, features, surfels, limits, flags, background, back, slot,
     pictures,
 ):  # fmt: skip
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
@@ -369,7 +370,7 @@ def _finish(
             store_block3(rgb, 3 * o, 3 * width, red, green, blue)
         if flags[1]:
             z = total(state, back, slot, k, Z, clear)
-            store_block(expected, o, width, where_greater(weight, NOTHING, z / max16(weight, NOTHING), ZERO))
+            store_block(expected, o, width, where_greater(weight, NOTHING, z / max16(weight, NOTHING) + shift, ZERO))
         if flags[2]:
             for lane in range(16):
                 number = int64(load1(state, k + MEDIAN + lane))

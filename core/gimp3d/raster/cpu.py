@@ -201,12 +201,12 @@ class Trace:
         return _backward(self, gradients)
 
 
-def disparity_shifts(lists: TileLists, features: np.ndarray, settings: RasterSettings) -> np.ndarray:
-    """A typical distortion_near / z of each tile, [S] float32: that of the middle entry."""
-    shifts = np.zeros(len(lists.tiles), np.float32)
+def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
+    """A typical depth of each tile, [S] float32: that of the middle entry, 1 without entries."""
+    shifts = np.ones(len(lists.tiles), np.float32)
     filled = np.flatnonzero(lists.stops > lists.starts)
     middle = lists.entries[(lists.starts[filled] + lists.stops[filled]) // 2]
-    shifts[filled] = np.float32(settings.distortion_near) / features[middle, DEPTH]
+    shifts[filled] = features[middle, DEPTH]
     return shifts
 
 
@@ -227,7 +227,7 @@ def _draw(
     view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
     slots, wanted = whole_picture(camera)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
-    shifts = disparity_shifts(lists, view.features, settings)
+    shifts = depth_shifts(lists, view.features)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
     return as_rendering(pictures, camera, view.ignored), kept
 
@@ -388,7 +388,7 @@ def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings
     slots, wanted = whole_picture(camera)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
     black = replace(settings, background=(0.0, 0.0, 0.0))
-    flags, shifts = pass_flags(frozenset({"rgb"})), np.zeros(len(wanted), np.float32)
+    flags, shifts = pass_flags(frozenset({"rgb"})), np.ones(len(wanted), np.float32)
     pictures, _ = blend(gaussians, view, camera, black, flags, view.features, lists, wanted, shifts, keep=False)
     return np.ascontiguousarray(as_rendering(pictures, camera, view.ignored).rgb[..., 0])
 

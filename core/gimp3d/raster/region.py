@@ -60,7 +60,7 @@ class CpuPixelRegion:
         self._features[:] = view.features[rows]
         self._lists = replace(lists, entries=entries.astype(np.int32).ravel())
         self._depths = np.ascontiguousarray(self._features[self._lists.entries, DEPTH])
-        self._shifts = cpu.disparity_shifts(self._lists, self._features, settings)
+        self._shifts = cpu.depth_shifts(self._lists, self._features)
         slots = len(self._wanted)
         self._layered = np.zeros(slots, bool)
         self._near, self._far = np.empty((2, slots), np.float32)  # the slabs of depths that the layers leave out

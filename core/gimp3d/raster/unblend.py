@@ -138,6 +138,7 @@ def unblend_range(
         slot = order[j]
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state, shift = states[slot], shifts[slot]
+        disparity_shift = distortion_near / shift
         first, end = starts[slot], stops[slot]
         _prepare(state, work, wanted[slot], left, top, width, flags, background, back, slot, gradients)
         for i in range(ends[slot], end):
@@ -174,8 +175,8 @@ def unblend_range(
                     free, alpha, inverse, blurred = surfel_alpha(
                         u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
                     )
-                    z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
-                    m = where_greater(blurred, ZERO, one, den) * disparity - shift
+                    z = where_greater(blurred, ZERO, splat16(depth), inverse * depth) - shift
+                    m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                     value = load16(work, k + G_W)
                     if with_rgb:
                         value = _three(work, k, G_R, red, green, blue, value)
@@ -227,7 +228,7 @@ def unblend_range(
                 xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
                 along0, down0 = fma16(column, xx, row * xy), row * yy
                 disparity = distortion_near / depth
-                z, m = splat16(depth), splat16(disparity - shift)
+                z, m = splat16(depth - shift), splat16(disparity - disparity_shift)
                 q, q_x, q_y, q_xx, q_xy, q_yy, s_m = none, none, none, none, none, none, none
                 while mask:
                     b = lowest_bit(mask)

@@ -161,8 +161,8 @@ def _block_loader(channels: int, channel: int) -> Any:
                 loaded = builder.load(_row_pointer(context, builder, sig, args, row, kind))
                 loaded.align = 4
                 rows.append(_shuffle(builder, loaded, loaded, list(range(channel, 4 * channels, channels))))
-            halves = [_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2)]
-            return _shuffle(builder, *halves, list(range(LANES)))
+            top, bottom = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
+            return _shuffle(builder, top, bottom, list(range(LANES)))
 
         return vec16(array, types.int64, types.int64), code
 

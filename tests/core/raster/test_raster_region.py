@@ -161,7 +161,11 @@ def test_layers_differ_from_the_whole_view_by_the_stop_only(surfels: bool) -> No
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("surfels", [False, True])
 def test_without_layers_pictures_and_gradients_are_bit_equal(surfels: bool, seed: int) -> None:
-    """With the median depth there are none; and where the active ones are everywhere they would save nothing."""
+    """With the median depth there are none; and where the active ones are everywhere they would save nothing.
+
+    Only the expected depth may differ in its last bits: a tile sums depths less a typical one, and the region takes
+    that from its frozen Gaussians.
+    """
     frozen, camera = frozen_scene(seed, surfels, 400), posed(VIEW, seed)
     pixels = some_pixels(camera, seed)
     everywhere = active_scene(seed, surfels, 300, 0.4, 8.0)
@@ -176,8 +180,12 @@ def test_without_layers_pictures_and_gradients_are_bit_equal(surfels: bool, seed
             np.testing.assert_array_equal(region._slab_stops - region._slab_starts, lengths(region))
         for name in pictures:
             inside = wanted_blocks(pixels)
-            np.testing.assert_array_equal(getattr(drawn, name)[inside], getattr(whole, name)[inside])
+            rounding = 1e-5 if name == "expected_depth" else 0
+            np.testing.assert_allclose(getattr(drawn, name)[inside], getattr(whole, name)[inside], rounding)
             assert not getattr(drawn, name)[~inside].any()
+        got, expected = both_gradients(region, frozen, active, upstream(camera, pictures, pixels, seed))
+        assert_close_gradients(got, expected, 1e-5)
+        pictures = [name for name in pictures if name != "expected_depth"]
         got, expected = both_gradients(region, frozen, active, upstream(camera, pictures, pixels, seed))
         for p in PARAMETERS:
             np.testing.assert_array_equal(getattr(got, p), getattr(expected, p))
