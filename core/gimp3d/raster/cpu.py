@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..buffers import empty, zeros
 from ..camera import Camera
 from ..gaussians import Gaussians
 from ..jit import announce_compilation
@@ -56,8 +57,8 @@ def project(
     announce_compilation()
     n = len(gaussians)
     if out is None:
-        features = aligned_rows(n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW)
-        out = View(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+        features = empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
+        out = View(features, empty((n, 4), np.int16), empty(n, np.int8))
     sh = raw(gaussians.sh)
     across, down = tile_grid(camera)
     run_ranges(
@@ -82,13 +83,6 @@ def project(
         out.states,
     )
     return out
-
-
-def aligned_rows(count: int, width: int) -> np.ndarray:
-    """Room for [count, width] float32 that begins with a cache line: rows astride two lines cost twice."""
-    room = np.empty(count * width + 16, np.float32)
-    skip = (-(room.ctypes.data // 4)) % 16
-    return room[skip : skip + count * width].reshape(count, width)
 
 
 def raw(values: np.ndarray) -> np.ndarray:
@@ -144,7 +138,7 @@ def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
     """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
     wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
     height, width = padded_size(camera)
-    return tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
+    return tuple(zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
 
 
 def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
@@ -258,10 +252,10 @@ def blend(
         lists,
         wanted,
         shifts,
-        np.empty(entry_count, np.uint64) if keep else NO_MASKS,
+        empty(entry_count, np.uint64) if keep else NO_MASKS,
         np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
         np.empty(slot_count, np.int64),
-        aligned_rows(slot_count, TILE_STATE) if keep else NO_STATES,
+        empty((slot_count, TILE_STATE), np.float32) if keep else NO_STATES,
         back,
     )
     pictures = empty_pictures(camera, flags)
@@ -299,7 +293,7 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
     ]
     if missing:
         raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
-    records = aligned_rows(len(lists.records), RECORD)
+    records = empty((len(lists.records), RECORD), np.float32)
     over_tiles(
         unblend_range,
         lists,
@@ -328,11 +322,11 @@ def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
     """Gradients of the traced Gaussians."""
     gaussians, settings, lists = traced.gaussians, traced.settings, traced.lists
     out = Gradients(
-        np.empty_like(gaussians.means, np.float32),
-        np.empty_like(gaussians.log_scales, np.float32),
-        np.empty_like(gaussians.quats, np.float32),
-        np.empty_like(gaussians.opacity_logits, np.float32),
-        np.empty_like(gaussians.sh, np.float32),
+        empty(gaussians.means.shape, np.float32),
+        empty(gaussians.log_scales.shape, np.float32),
+        empty(gaussians.quats.shape, np.float32),
+        empty(gaussians.opacity_logits.shape, np.float32),
+        empty(gaussians.sh.shape, np.float32),
     )
     run_ranges(
         unproject_range,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..buffers import empty
 from ..camera import Camera
 from ..gaussians import Gaussians
 from ..jit import exact_kernel
@@ -56,7 +57,7 @@ class CpuPixelRegion:
         lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
         rows, entries = np.unique(lists.entries, return_inverse=True)
         self._frozen_count, self._surfels = len(rows), frozen.is_surfels
-        self._features = cpu.aligned_rows(len(rows), view.features.shape[1])
+        self._features = empty((len(rows), view.features.shape[1]), np.float32)
         self._features[:] = view.features[rows]
         self._lists = replace(lists, entries=entries.astype(np.int32).ravel())
         self._depths = np.ascontiguousarray(self._features[self._lists.entries, DEPTH])
@@ -66,7 +67,7 @@ class CpuPixelRegion:
         self._near, self._far = np.empty((2, slots), np.float32)  # the slabs of depths that the layers leave out
         self._slab_starts, self._slab_stops = lists.starts.copy(), lists.stops.copy()
         layered = slots if not self._flags[2] else 0
-        self._front, self._back = cpu.aligned_rows(layered, TILE_STATE), cpu.aligned_rows(layered, TILE_STATE)
+        self._front, self._back = empty((layered, TILE_STATE), np.float32), empty((layered, TILE_STATE), np.float32)
         self._renderings = 0
 
     def render(self, active: Gaussians) -> Rendering:
@@ -109,7 +110,7 @@ class CpuPixelRegion:
         needed = self._frozen_count + len(active)
         if len(self._features) != needed:
             before = self._features
-            self._features = cpu.aligned_rows(needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW)
+            self._features = empty((needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW), np.float32)
             self._features[: self._frozen_count] = before[: self._frozen_count]
         n = len(active)
         out = cpu.View(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
@@ -139,7 +140,7 @@ class CpuPixelRegion:
 
     def _layer(self, slots: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
         """The state of the slots' tiles after a part of their frozen entries, [·, TILE_STATE]."""
-        states = cpu.aligned_rows(len(slots), TILE_STATE)
+        states = empty((len(slots), TILE_STATE), np.float32)
         cpu.over_tiles(
             blend_range,
             replace(self._lists, tiles=self._lists.tiles[slots], starts=starts, stops=stops),
