@@ -16,7 +16,7 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, footprint, render
+from .raster import RasterSettings, footprint, render, surface_depth
 from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -265,7 +265,7 @@ def _fill_from_one_view(
             v.silhouette,
             v.target,
             v.depth_before,
-            render(with_seeds, v.camera, RasterSettings(), frozenset({"depth"})).median_depth,
+            surface_depth(with_seeds, v.camera)[0],
         ),
         open_views,
     )
@@ -359,12 +359,12 @@ def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarra
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
-    after = render(filled, view.camera, RasterSettings(), frozenset({"depth", "alpha"}))
+    depth_after, alpha_after = surface_depth(filled, view.camera)
     return replace(
         view,
         target=view.target & (~covered | (rules == Rule.UNREACHED)),
-        depth_after=after.median_depth,
-        alpha_after=after.alpha,
+        depth_after=depth_after,
+        alpha_after=alpha_after,
     )
 
 
