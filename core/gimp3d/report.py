@@ -23,6 +23,7 @@ RULE_COLOURS = {
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
+MOST_SCORES = 6  # views listed for each reference
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -157,7 +158,31 @@ def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictur
         f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>{warnings}"
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
+        f"{_references(summary['references'])}"
         f"<h2>What each stage saw</h2><p>{legend}</p><div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
     )
+
+
+def _references(choices: Sequence[dict[str, Any]]) -> str:
+    """Why each reference was chosen: the best views' scores as a table."""
+    tables = []
+    for choice in choices:
+        chosen = choice["camera_id"]
+        listed = [s for k, s in enumerate(choice["scores"]) if k < MOST_SCORES or s["camera_id"] == chosen]
+        rows = "".join(
+            f"<tr><td>{'<b>' if s['camera_id'] == chosen else ''}{html.escape(s['camera_id'])}</td>"
+            f"<td class=n>{s['score']:.2f}</td>"
+            f"<td style='width:22%'><div class=bar style='width:{100 * s['score']:.0f}%'></div></td>"
+            f"<td class=n>{s['covered']:.0%}</td><td class=n>{s['facing']:.2f}</td>"
+            f"<td class=n>{s['detail']:.0%}</td></tr>"
+            for s in listed
+        )
+        plan = ", ".join(f"{html.escape(name)} ({share:.0%})" for name, share in choice["plan"])
+        tables.append(
+            "<table><tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
+            f"{rows}</table><p>{len(choice['scores'])} candidates. Covered by the chosen view, then by the next best: "
+            f"{plan}</p>"
+        )
+    return f"<h2>Reference views</h2>{''.join(tables)}" if tables else ""
