@@ -310,6 +310,7 @@ def _summary(
             "views": result.views,
             "hole_pixels": result.hole_pixels,
         },
+        "references": [asdict(choice) for choice in result.references],
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],
         "peak_memory_mb": round(peak_memory_mb(), 1),
