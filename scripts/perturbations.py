@@ -61,9 +61,17 @@ class NoisyDepths:
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
     ) -> Rendering:
         drawn = self.backend.render(gaussians, camera, settings, passes)
-        factor = 1 + self.relative * depth_errors(camera.id, camera.height, camera.width, self.seed)
         depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
-        return replace(drawn, **{name: z * factor for name, z in depths.items() if z.size})
+        return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
+
+    def surface_depth(
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
+    ) -> tuple[np.ndarray, np.ndarray]:
+        depth, alpha = self.backend.surface_depth(gaussians, camera, settings)
+        return depth * self._factor(camera), alpha
+
+    def _factor(self, camera: Camera) -> np.ndarray:
+        return 1 + self.relative * depth_errors(camera.id, camera.height, camera.width, self.seed)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.backend, name)

@@ -39,9 +39,10 @@ def sections(results: dict[str, Any]) -> Iterator[Section]:
     )
     yield Section(
         "References",
-        "The chosen reference and the next best by score; then what share of T in all training views the completed "
-        "surface of the first reaches, and what each further one, chosen with the reached pixels taken out, adds.",
-        ["scene", "chosen", "next best (score, of the best)", "reached by the first, second …"],
+        "Chosen among the training views by what they show of the surface that has to be made up: the share of it, how "
+        "squarely (mean cosine) and how finely (of the finest view). Then what share the first reference covers, and "
+        "what each further one, chosen greedily, adds.",
+        ["scene", "chosen", "score", "shows", "squarely", "finely", "next best", "first, second … add"],
         [reference_row(r) for r in results["references"]],
     )
     yield Section(
@@ -90,10 +91,12 @@ def mean_masks(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 
 def reference_row(row: dict[str, Any]) -> list[str]:
     if "refused" in row:
-        return [row["scene"], row["refused"], "", ""]
-    others = ", ".join(f"{output_name(r['view'])} {r['of_best']:.2f}" for r in row["runners_up"])
-    steps = ", ".join(f"{s['gain']:.1%}" for s in row["steps"])
-    return [row["scene"], output_name(row["chosen"]), others, steps]
+        return [row["scene"], row["refused"], *[""] * 6]
+    first = row["chosen"]
+    others = ", ".join(f"{output_name(r['view'])} {r['score']:.2f}" for r in row["runners_up"])
+    steps = ", ".join(f"{s['adds']:.1%}" for s in row["plan"])
+    shares = [f"{first['covered']:.1%}", f"{first['facing']:.2f}", f"{first['detail']:.0%}"]
+    return [row["scene"], output_name(first["camera_id"]), f"{first['score']:.2f}", *shares, others, steps]
 
 
 def depth_rows(rows: list[dict[str, Any]]) -> Iterator[list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from gimp3d.stages.reference import choose_reference, disparity_of, rim
 SHADOW = "_shadow"  # what a scene's name ends in whose photos show the object's shadows and reflections
 SEES_PHOTOS = "photos" in inspect.signature(find_masks).parameters
 TOUCHED = np.ones((3, 3), np.uint8)
-MOST_REFERENCES = 5  # as many as the preset with the most takes
 SOLID = MaskSettings().solid
 
 
@@ -184,58 +183,15 @@ def surface_scores(scene: Scene, masks: Masks, settings: DepthSettings = DepthSe
 
 
 def reference_scores(masks: Masks) -> dict[str, Any]:
-    """The chosen reference with its runners-up, and what share of T in all views each further one reaches.
-
-    A pixel is reached if a reference's completed surface projects on it. Further references are chosen like the first,
-    with what was reached taken out of T.
-    """
-    total, views = masks.hole_pixels, masks.views
-    steps: list[dict[str, Any]] = []
-    choice = None
-    while len(steps) < MOST_REFERENCES:
-        try:
-            next_choice = choose_reference(views)
-        except IllPosed:
-            break
-        choice = choice or next_choice
-        reference = next(v for v in views if v.camera.id == next_choice.camera_id)
-        depth = surface(reference, completed(reference))
-        before = sum(int(v.target.sum()) for v in views)
-        views = tuple(without_reached(v, reference, depth) for v in views)
-        gain = (before - sum(int(v.target.sum()) for v in views)) / max(1, total)
-        steps.append({"view": next_choice.camera_id, "gain": gain})
-        if gain == 0:
-            break
-    if choice is None:
-        return {"refused": "no view can be the reference"}
-    best = choice.scores[0][1]
+    """The chosen reference with its runners-up, and what share of the needed surface each further one adds."""
+    try:
+        choice = choose_reference(masks.views)
+    except IllPosed as error:
+        return {"refused": str(error)}
+    covered = [share for _, share in choice.plan]
     return {
-        "chosen": choice.camera_id,
+        "chosen": asdict(choice.scores[0]),
         "reason": choice.reason,
-        "runners_up": [{"view": name, "of_best": score / best} for name, score in choice.scores[1:4]],
-        "steps": steps,
+        "runners_up": [{"view": s.camera_id, "score": s.score} for s in choice.scores[1:4]],
+        "plan": [{"view": name, "adds": share - before} for (name, share), before in zip(choice.plan, [0.0, *covered])],
     }
-
-
-def without_reached(
-    view: ViewMasks,
-    reference: ViewMasks,
-    depth: np.ndarray,  # [H, W] the reference's surface
-) -> ViewMasks:
-    """The view with the reference's surface in it, and T without what that covers."""
-    rows, cols = np.nonzero(reference.target & (depth > 0))
-    points = reference.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
-    uv, z = view.camera.project(points)
-    with np.errstate(invalid="ignore"):
-        framed = (z > 0) & (uv >= 0).all(-1) & (uv < [view.camera.width, view.camera.height]).all(-1)
-    nearest = np.full(view.target.shape, np.inf, np.float32)
-    c, r = uv[framed].astype(int).T
-    np.minimum.at(nearest, (r, c), z[framed])
-    nearest = cv2.erode(nearest, TOUCHED)  # a view nearer than the reference has gaps between its points
-    reached = view.target & np.isfinite(nearest)
-    return replace(
-        view,
-        target=view.target & ~reached,
-        depth_after=np.where(reached, nearest, view.depth_after),
-        alpha_after=np.where(reached, np.float32(1), view.alpha_after),
-    )
