@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from surface_scenes import Scene, completed, depth_errors, surface, targets
@@ -39,14 +41,14 @@ def overlay(scene: Scene, camera: Camera, target: np.ndarray) -> np.ndarray:
 def depth_sheet(scene: Scene, masks: Masks) -> np.ndarray:
     """A row per test view, [H, W, 3] uint8: true picture, completed surface, true surface, relative error."""
     views = {v.camera.id: v for v in masks.views}
-    return sheet([t for c in scene.test if c.id in views for t in surface_tiles(scene, views[c.id])], 4)
+    return sheet([t for c in scene.test if c.id in views for t in surface_tiles(scene, views[c.id], masks.views)], 4)
 
 
-def surface_tiles(scene: Scene, view: ViewMasks) -> list[np.ndarray]:
+def surface_tiles(scene: Scene, view: ViewMasks, views: Sequence[ViewMasks]) -> list[np.ndarray]:
     camera = view.camera
     picture, unseen, truth = read_image(scene.folder / camera.id), scene.unseen(camera), scene.depth(camera)
     try:
-        completion = completed(view)
+        completion = completed(view, views)
         depth, words = surface(view, completion), completion.reason
     except IllPosed as error:
         depth, words = view.depth_after, str(error)

@@ -20,12 +20,14 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import load_view, read_mask
 from gimp3d.io.ply import read_ply
+from gimp3d.stages import depth as depth_stage
 from gimp3d.stages.depth import DepthCompletion, DepthSettings, complete_disparity
 from gimp3d.stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from gimp3d.stages.reference import choose_reference, disparity_of, rim
 
 SHADOW = "_shadow"  # what a scene's name ends in whose photos show the object's shadows and reflections
 SEES_PHOTOS = "photos" in inspect.signature(find_masks).parameters
+COMPLETE_DEPTH = getattr(depth_stage, "complete_depth", None)  # with what other views know of the hole, where it can
 TOUCHED = np.ones((3, 3), np.uint8)
 SOLID = MaskSettings().solid
 
@@ -137,9 +139,15 @@ def mask_scores(scene: Scene, masks: Masks) -> dict[str, float]:
     }
 
 
-def completed(view: ViewMasks, settings: DepthSettings = DepthSettings()) -> DepthCompletion:
-    """The surface behind the object in a view, as a removal completes it."""
-    return complete_disparity(disparity_of(view.depth_after), rim(view, SOLID), view.target, None, settings)
+def completed(
+    view: ViewMasks, views: Sequence[ViewMasks], settings: DepthSettings = DepthSettings()
+) -> DepthCompletion:
+    """The surface behind the object in a view, as a removal with these training views completes it."""
+    disparity, known = disparity_of(view.depth_after), rim(view, SOLID)
+    if COMPLETE_DEPTH is None:
+        return complete_disparity(disparity, known, view.target, None, settings)
+    used = [v for v in views if v is view or v.camera.split == "train"]
+    return COMPLETE_DEPTH(view, used, disparity, known, settings=settings)
 
 
 def surface(view: ViewMasks, completion: DepthCompletion) -> np.ndarray:
@@ -173,7 +181,7 @@ def surface_scores(scene: Scene, masks: Masks, settings: DepthSettings = DepthSe
         row["covered"] = shares([(view.target, cv2.erode(unseen.astype(np.uint8), TOUCHED) > 0)])[0]
         row["area"] = float(view.target.sum() / max(1, unseen.sum()))
         try:
-            completion = completed(view, settings)
+            completion = completed(view, masks.views, settings)
         except IllPosed as error:
             row["refused"] = str(error)
             continue

@@ -494,7 +494,7 @@ def test_what_stands_before_the_hole_stays_alone(case: str, remove: Remove) -> N
     for camera, mask in zip(views, on_rod):
         error = np.abs(render_bytes(result, camera).astype(float) - render_bytes(true, camera)).max(-1)
         if case.startswith("a rod"):
-            assert error[mask].mean() < 6, camera.id  # grey levels
+            assert (error[mask] > 40).mean() < 0.1, camera.id  # grey levels
         else:
             assert (error[~mask] > 80).sum() < 10, camera.id  # the rod's blue is 150 off the floor's colours
 

@@ -76,7 +76,7 @@ def depth_error(masks: Masks, references: Sequence[Camera] = REFERENCES) -> floa
             index = VIEWS.index(view.camera)
             there = under_the_block(index)
             z = true_depth(index)[there]
-            errors.append(float(np.median(np.abs(surface(view, completed(view))[there] - z) / z)))
+            errors.append(float(np.median(np.abs(surface(view, completed(view, masks.views))[there] - z) / z)))
     assert len(errors) == len(references)
     return max(errors)
 
