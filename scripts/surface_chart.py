@@ -41,7 +41,7 @@ class Measure:
             values = np.arange(1, axis.low - 1e-9, -step)
             return {float(v): f"{v:.0%}" for v in values}
         decades = range(math.floor(math.log10(axis.low)), math.ceil(math.log10(axis.high)) + 1)
-        steps = (1, 2, 5) if axis.high / axis.low < 150 else (1,)
+        steps = (1, 2, 5) if axis.high / axis.low < 500 else (1,)
         values = [s * 10.0**d for d in decades for s in steps]
         return {v: f"{v:g}" for v in values if 0.999 * axis.low <= v <= 1.001 * axis.high}
 

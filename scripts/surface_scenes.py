@@ -28,7 +28,6 @@ from gimp3d.stages.reference import choose_reference, disparity_of, rim
 SHADOW = "_shadow"  # what a scene's name ends in whose photos show the object's shadows and reflections
 SEES_PHOTOS = "photos" in inspect.signature(find_masks).parameters
 COMPLETE_DEPTH = getattr(depth_stage, "complete_depth", None)  # with what other views know of the hole, where it can
-TOUCHED = np.ones((3, 3), np.uint8)
 SOLID = MaskSettings().solid
 
 
@@ -122,12 +121,16 @@ def overlap(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> tuple[float, 
     return shares([(a[name] & b[name], a[name] | b[name]) for name in a])
 
 
+def without_rim(mask: np.ndarray) -> np.ndarray:
+    """The mask [H, W] without its outermost pixels, which show both sides; the frame is no rim."""
+    return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
 def mask_scores(scene: Scene, masks: Masks) -> dict[str, float]:
     """T of the training views against what no view sees, and the silhouettes against what the object hides."""
     found = targets(masks, scene.train)
     unseen = {c.id: scene.unseen(c) for c in scene.train}
-    within = {name: cv2.erode(mask.astype(np.uint8), TOUCHED) > 0 for name, mask in unseen.items()}
-    covered, worst = shares([(found[name], within[name]) for name in found])
+    covered, worst = shares([(found[name], without_rim(unseen[name])) for name in found])
     hidden = {v.camera.id: scene.hides(v.camera) for v in masks.views if v.camera.id in found}
     silhouettes = {v.camera.id: v.silhouette for v in masks.views if v.camera.id in found}
     return {
@@ -157,7 +160,7 @@ def surface(view: ViewMasks, completion: DepthCompletion) -> np.ndarray:
 
 def depth_scores(scene: Scene, view: ViewMasks, depth: np.ndarray) -> dict[str, float]:
     """Relative errors of z where no view sees the surface, also where T missed it; nothing there is an error of 1."""
-    error = depth_errors(scene, view.camera, depth)[scene.unseen(view.camera)]
+    error = depth_errors(scene, view.camera, depth)[without_rim(scene.unseen(view.camera))]
     return {"median": float(np.median(error)), "p95": float(np.percentile(error, 95))}
 
 
@@ -178,7 +181,7 @@ def surface_scores(scene: Scene, masks: Masks, settings: DepthSettings = DepthSe
             row["refused"] = "the view does not frame the region"
             continue
         view, unseen = views[camera.id], scene.unseen(camera)
-        row["covered"] = shares([(view.target, cv2.erode(unseen.astype(np.uint8), TOUCHED) > 0)])[0]
+        row["covered"] = shares([(view.target, without_rim(unseen))])[0]
         row["area"] = float(view.target.sum() / max(1, unseen.sum()))
         try:
             completion = completed(view, masks.views, settings)
