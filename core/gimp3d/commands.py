@@ -18,8 +18,8 @@ from .box import read_region
 from .camera import Camera
 from .errors import BadInput
 from .io.cameras import read_cameras, write_transforms
-from .io.images import load_view, read_image, undistorted, write_png
 from .io.formats import read_scene
+from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
