@@ -103,10 +103,12 @@ def write_ply(
     ]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
     kept = table.rows[np.asarray(keep, dtype=bool)]
-    new = new_rows(table, added) if added is not None and len(added) else None
-    for name in new.dtype.names or () if new is not None else ():
-        if not np.isfinite(new[name]).all():
-            raise ValueError(f"a new Gaussian has a {name} that is not finite")
+    new = None
+    if added is not None and len(added):
+        new = new_rows(table, added)
+        for name in new.dtype.names or ():
+            if not np.isfinite(new[name]).all():
+                raise ValueError(f"a new Gaussian has a {name} that is not finite")
 
     def write(f):  # type: ignore[no-untyped-def]
         f.write(header)
