@@ -56,7 +56,7 @@ def read_scene(path: Path | str) -> SplatFile:
             return file_of(_from_splat(path))
     except OSError as error:
         raise BadInput(f"cannot read {path} ({error.strerror or error})") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise BadInput(f"{path} is damaged ({error})") from None
     raise BadInput(f"{path} is not a PLY, nor a .splat, .spz or .sog scene")
 

@@ -103,7 +103,12 @@ def write_ply(
     ]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
     kept = table.rows[np.asarray(keep, dtype=bool)]
-    new = new_rows(table, added) if added is not None and len(added) else None
+    new = None
+    if added is not None and len(added):
+        new = new_rows(table, added)
+        for name in new.dtype.names or ():
+            if not np.isfinite(new[name]).all():
+                raise ValueError(f"a new Gaussian has a {name} that is not finite")
 
     def write(f):  # type: ignore[no-untyped-def]
         f.write(header)
@@ -348,8 +353,6 @@ def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
     records = np.zeros(len(added), table.dtype)
     for p in table.properties:
         if p.name in fields:
-            if not np.isfinite(fields[p.name]).all():
-                raise ValueError(f"a new Gaussian has a {p.name} that is not finite")
             records[p.name] = fields[p.name]
     return records
 
