@@ -86,6 +86,8 @@ def mask_row(row: dict[str, Any]) -> list[str]:
 def mean_masks(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     for mode in dict.fromkeys(r["mode"] for r in rows):
         of_mode = [r for r in rows if r["mode"] == mode and not r["scene"].endswith(SHADOW)]
+        if not of_mode:
+            continue
         numbers = [key for key, value in of_mode[0].items() if not isinstance(value, str)]
         yield {
             "scene": "mean without shadows",
