@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from gimp3d.solvers.poisson import PoissonSettings, solve_poisson
 
 EXACT = PoissonSettings(tolerance=1e-10)
-ALWAYS_MULTIGRID = PoissonSettings(tolerance=1e-10, direct_below=0, coarsest=4, most_iterations=500)
+ALWAYS_MULTIGRID = PoissonSettings(tolerance=1e-10, most_iterations=500)
 
 
 def reference(hole, known, values, guidance=None, weight=None, anchor=None):
