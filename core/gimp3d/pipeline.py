@@ -16,7 +16,7 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, footprint, render
+from .raster import RasterSettings, footprint, render, surface_depth
 from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -33,6 +33,7 @@ from .stages.reference import (
     EvidenceSettings,
     ReferenceChoice,
     ReferenceSettings,
+    ViewScore,
     choose_reference,
     disparity_of,
     gather_evidence,
@@ -109,6 +110,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
+    references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
 
 
@@ -136,6 +138,7 @@ class _Run:
         self.stages: list[StageReport] = []
         self.warnings: list[str] = []
         self.pictures: list[Picture] = []
+        self.references: list[ReferenceChoice] = []
 
     def __call__(self, name: str, work: Callable[[], R], words: Callable[[R], tuple[float, str]] | None = None) -> R:
         self.progress(name, 0, 1)
@@ -246,6 +249,7 @@ def _fill_from_one_view(
     choice: ReferenceChoice = run(
         f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference)
     )
+    run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
     completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
@@ -265,7 +269,7 @@ def _fill_from_one_view(
             v.silhouette,
             v.target,
             v.depth_before,
-            render(with_seeds, v.camera, RasterSettings(), frozenset({"depth"})).median_depth,
+            surface_depth(with_seeds, v.camera)[0],
         ),
         open_views,
     )
@@ -359,12 +363,12 @@ def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarra
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
-    after = render(filled, view.camera, RasterSettings(), frozenset({"depth", "alpha"}))
+    depth_after, alpha_after = surface_depth(filled, view.camera)
     return replace(
         view,
         target=view.target & (~covered | (rules == Rule.UNREACHED)),
-        depth_after=after.median_depth,
-        alpha_after=after.alpha,
+        depth_after=depth_after,
+        alpha_after=alpha_after,
     )
 
 
@@ -401,6 +405,7 @@ def _finish(
         views=len(masks.views),
         painted=painted,
         pictures=tuple(run.pictures),
+        references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
     )
 
@@ -412,6 +417,7 @@ STORED = (
     Masks,
     ViewMasks,
     ReferenceChoice,
+    ViewScore,
     DepthCompletion,
     MappingField,
     Propagation,

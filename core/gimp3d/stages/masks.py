@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import RasterSettings, contributions, footprint, render
+from ..raster import RasterSettings, contributions, footprint, render, surface_depth
 from ..threads import parallel_map
 
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
@@ -242,11 +242,11 @@ def _measure_view(
     """A view before and after the removal, with T as the paper defines it."""
     raster = RasterSettings()
     polygon = np.any([fill_polygon(p, camera.width, camera.height) for p in polygons], axis=0)
-    before = render(gaussians, camera, raster, frozenset({"depth"}))
-    after = render(kept, camera, raster, frozenset({"depth", "alpha"}))
+    before, _ = surface_depth(gaussians, camera, raster)
+    after, alpha_after = surface_depth(kept, camera, raster)
     weight = footprint(gaussians, camera, removed, raster)
     silhouette = weight > settings.changed
-    occluder = _in_front(before.median_depth, weight > 0.5, settings)
+    occluder = _in_front(before, weight > 0.5, settings)
     if settings.mode == "paper":
         guards = np.any(
             [
@@ -265,9 +265,9 @@ def _measure_view(
         silhouette,
         occluder,
         target & ~occluder,
-        before.median_depth,
-        after.median_depth,
-        after.alpha,
+        before,
+        after,
+        alpha_after,
     )
 
 
