@@ -39,6 +39,13 @@ MANY = 1000  # grids of more nodes are visited twice
 GAP = 8  # spans go on over gaps of so many places
 DAMPING = 0.9  # of the Jacobi step, against one that could just diverge
 INSIDE, PLAIN = 1, 2  # flags of pixels and nodes: an unknown; its stencil is that of the inner hole
+# PᵀAP in one dimension: what the link d − 1 of the finer node a − 1 gives to the link J − 1 of the node in the middle
+SHARES = np.array(
+    [
+        [[(1 - abs(a) / 2) * max(0, 1 - abs(a + d - 2 * J) / 2) for J in (-1, 0, 1)] for d in (-1, 0, 1)]
+        for a in (-1, 0, 1)
+    ]
+)
 DESCEND, DESCEND_AGAIN, ASCEND, SOLVE = range(4)  # tasks of a cycle
 ONE, TWO = np.uint64(1), np.uint64(2)  # places are unsigned: numba would wrap signed ones, and not vectorise
 
@@ -113,17 +120,18 @@ class Multigrid:
 
     def solve(
         self,
-        places: np.ndarray,  # [T] int64, see places_of
-        amounts: np.ndarray,  # [T], what is there on the right; of about unit size
+        places: np.ndarray,  # [T] int64, always the same
+        amounts: np.ndarray,  # [T], what there is on the right, elsewhere 0; of about unit size
         tolerance: float,
         most_iterations: int,
     ) -> tuple[int, bool]:
-        """Set `u` and `right`, [2, rows · stride]. Returns the iterations taken, and whether they converged.
+        """Set `u` [2, rows · stride]; the iterations taken, and whether they converged.
 
         They have when the residual, each equation divided by its D, is at most `tolerance` times the first one
         (Euclidean norms), or when rounding lets it fall no further.
         """
-        self.u[...], self.right[...], self.work.x[...], self.work.p[...] = 0, 0, 0, 0
+        self.u[...] = 0
+        self.right.reshape(-1)[places] = 0
         np.add.at(self.right.reshape(-1), places, amounts.astype(self.right.dtype))
         norm = _find_residual(self.fine, self.inverse, self.right, self.u, self.work)
         enough, iterations, steepness = tolerance * norm, 0, 0.0
@@ -154,7 +162,7 @@ def row_stride(columns: int) -> int:
 
 @kernel
 def _find_residual(fine, inverse, right, u, work):
-    """u ← u + x on black pixels, x ← 0; red ones follow. t ← (right − A·u) / D on black, where all of it is; its norm."""
+    """u ← u + x on black pixels, x ← 0; red ones follow. t ← (right − A·u) / D, which is on black only; its norm."""
     n, x, t = np.uint64(fine.stride), work.x, work.t
     squares = 0.0
     for i in range(1, fine.rows + 1):
@@ -222,7 +230,7 @@ def _advance(fine, coarse, work, alpha):
                     value = t[k] - alpha * q[k]
                     t[k] = value
                     total += value * value
-                squares += total
+                squares += float(total)
         if 1 < i < fine.rows:
             odd = np.uint64((i - 1) & 1)
             for s in range(fine.first[i - 1], fine.first[i]):
@@ -307,7 +315,7 @@ def _ascend(coarse, work, g):
 
 @kernel
 def _correct(fine, coarse, work):
-    """z ← t after a V-cycle; the product of t and z in D. q is used up."""
+    """z ← t after a cycle; the product of t and z in D. q is used up."""
     t, q, z, w = work.t, work.q, work.z, work.w
     n, m, half = np.uint64(fine.stride), coarse.strides[0], np.float32(0.5)
     product = 0.0
@@ -330,7 +338,7 @@ def _correct(fine, coarse, work):
                     value = t[k] + fine.inverse[0, k] * around
                     z[k] = value
                     total += fine.diagonal[k] * t[k] * value
-                product += total
+                product += float(total)
     return product
 
 
@@ -359,7 +367,7 @@ def _turn(fine, work, beta):
                     value = p[k] - fine.inverse[0, k] * around
                     q[k] = value
                     total += fine.diagonal[k] * p[k] * value
-                product += total
+                product += float(total)
     return product
 
 
@@ -412,7 +420,7 @@ def _fill(inside, first, spans, stride, inverse, inverse32, diagonal, flags):
                     around += inside[i, j + 1] & 1
                     d = around + inverse[colour, k]
                     flags[i, j] = INSIDE | PLAIN if around == 4 and d == 4 else INSIDE
-                    inverse[colour, k] = 1 / d if d > 0 else 0
+                    inverse[colour, k] = 1 / d
                     inverse32[colour, k] = inverse[colour, k]
                     if colour == 0:
                         diagonal[k] = d
@@ -420,7 +428,8 @@ def _fill(inside, first, spans, stride, inverse, inverse32, diagonal, flags):
 
 def _coarsen(flags: np.ndarray, fine: Fine) -> Coarse:
     """The hierarchy of grids over that of the pixels with these flags."""
-    sides, nodes = [flags.shape], []
+    sides: list[tuple[int, ...]] = [flags.shape]
+    nodes: list[tuple[int, ...]] = []
     while not nodes or nodes[-1][0] * nodes[-1][1] > COARSEST:
         nodes.append(tuple((n - 1) // 2 for n in sides[-1]))
         sides.append(tuple(n + 3 - n % 2 for n in nodes[-1]))
@@ -451,58 +460,60 @@ def _cycle(twice: list[bool], grid: int = 0, task: int = DESCEND) -> list[tuple[
 @kernel
 def _build(flags, fine, nodes, rows, strides, offsets, first_rows, first, spans, marks, stencils, steps):
     """Marks (the flags of nodes), spans, stencils and steps, grid by grid."""
-    count = 0
-    nine, row = np.zeros(9), np.zeros(9)
-    image = flags.reshape(-1)
-    width = np.uint64(flags.shape[1])
+    count, around, scratch = 0, np.zeros((3, 3)), np.zeros((2, 3, 3))
     for g in range(len(rows)):
-        n, plain = strides[g], ONE
+        finer = flags.reshape(-1) if g == 0 else marks
+        m = np.uint64(flags.shape[1]) if g == 0 else strides[g - 1]
+        origin = np.uint64(0) if g == 0 else offsets[g - 1]
+        plain = np.uint64(0)  # a node with the stencil of the inner hole
         for i in range(1, nodes[g, 0] + 1):
-            base = offsets[g] + np.uint64(i) * n
-            if g == 0:
-                _mark(image, np.uint64(2 * i - 1) * width, width, marks, base, nodes[g, 1])
-            else:
-                _mark(
-                    marks,
-                    offsets[g - 1] + np.uint64(2 * i - 1) * strides[g - 1],
-                    strides[g - 1],
-                    marks,
-                    base,
-                    nodes[g, 1],
-                )
-            r = first_rows[g] + i
+            base, r = offsets[g] + np.uint64(i) * strides[g], first_rows[g] + i
+            below = origin + np.uint64(2 * i - 1) * m
+            _mark(finer, below, m, marks, base, nodes[g, 1])
             first[r] = count
             count = _span_row(marks, base, nodes[g, 1], spans, count)
             for s in range(first[r], count):
                 for k in range(spans[s, 0], spans[s, 1]):
-                    if not marks[k]:
-                        continue
-                    if marks[k] & PLAIN and plain > ONE:
+                    if marks[k] & PLAIN and plain > 0:
                         for d in range(5):
                             stencils[d, k] = stencils[d, plain]
                         steps[k] = steps[plain]
-                        continue
-                    J = np.int64(k - base)
-                    row[:] = 0
-                    for y in range(2 * i - 2, 2 * i + 1):
-                        for x in range(2 * J - 2, 2 * J + 1):
-                            if g == 0:
-                                inside = _pixel_equation(flags, fine, y, x, nine)
-                            else:
-                                f = offsets[g - 1] + np.uint64(y) * strides[g - 1] + np.uint64(x)
-                                inside = _node_equation(marks, stencils, f, strides[g - 1], nine)
-                            if inside:
-                                _collapse(nine, y, x, i, J, row)
-                    size = 0.0
-                    for d in range(9):
-                        size += abs(row[d])
-                    for d in range(5):
-                        stencils[d, k] = row[4 + d]
-                    # Gershgorin: an eigenvalue of 2 would diverge
-                    steps[k] = DAMPING * min(2 / size, 1 / (DAMPING * row[4]))
-                    if marks[k] & PLAIN:
-                        plain = k
+                    elif marks[k]:
+                        _collapse(g == 0, finer, fine, stencils, below + TWO * (k - base) - ONE, m, around, scratch)
+                        size = 0.0
+                        for d in range(9):
+                            size += abs(around[d // 3, d % 3])
+                        for d in range(5):
+                            stencils[d, k] = around[(4 + d) // 3, (4 + d) % 3]
+                        # Gershgorin: an eigenvalue of 2 would diverge
+                        steps[k] = min(2 * DAMPING / size, 1 / around[1, 1])
+                        if marks[k] & PLAIN:
+                            plain = np.uint64(k)
         first[first_rows[g] + nodes[g, 0] + 1 : first_rows[g] + rows[g] + 1] = count
+
+
+@kernel
+def _collapse(finest, finer, fine, stencils, f, m, around, scratch):
+    """around ← the entries [3, 3] of PᵀAP at the node that lies on the finer place f."""
+    equation, beside = scratch[0], scratch[1]
+    equation[:], around[:] = 0, 0
+    for y in range(3):
+        beside[:] = 0
+        for x in range(3):
+            k = f + np.uint64(y) * m + np.uint64(x) - m - ONE
+            if finer[k]:
+                if finest:
+                    _pixel_equation(finer, fine, k, m, equation)
+                else:
+                    _node_equation(stencils, k, m, equation)
+                for d in range(3):
+                    for e in range(3):
+                        for J in range(3):
+                            beside[d, J] += SHARES[x, e, J] * equation[d, e]
+        for d in range(3):
+            for I in range(3):
+                for J in range(3):
+                    around[I, J] += SHARES[y, d, I] * beside[d, J]
 
 
 @kernel
@@ -532,41 +543,21 @@ def _span_row(marks, base, columns, spans, count):
 
 
 @kernel
-def _pixel_equation(flags, fine, y, x, nine):
-    """The entries of a pixel's equation, row by row round the centre 4; whether it is in the hole."""
-    if not flags[y, x]:
-        return False
-    nine[:] = 0
-    nine[1], nine[3] = -(flags[y - 1, x] & INSIDE), -(flags[y, x - 1] & INSIDE)
-    nine[5], nine[7] = -(flags[y, x + 1] & INSIDE), -(flags[y + 1, x] & INSIDE)
-    nine[4] = 1 / fine.inverse[(y + x) & 1, y * fine.stride + x // 2]
-    return True
+def _pixel_equation(flags, fine, k, m, equation):
+    """The entries [3, 3] of a pixel's equation."""
+    y, x = np.int64(k // m), np.int64(k % m)
+    equation[1, 1] = 1 / fine.inverse[(y + x) & 1, y * fine.stride + x // 2]
+    equation[0, 1], equation[2, 1] = -(flags[k - m] & INSIDE), -(flags[k + m] & INSIDE)
+    equation[1, 0], equation[1, 2] = -(flags[k - ONE] & INSIDE), -(flags[k + ONE] & INSIDE)
 
 
 @kernel
-def _node_equation(marks, stencils, f, n, nine):
-    if not marks[f]:
-        return False
-    nine[0], nine[1], nine[2] = stencils[4, f - n - ONE], stencils[3, f - n], stencils[2, f - n + ONE]
-    nine[3] = stencils[1, f - ONE]
-    for d in range(5):
-        nine[4 + d] = stencils[d, f]
-    return True
-
-
-@kernel
-def _collapse(nine, y, x, I, J, row):
-    """The row of PᵀAP at (I, J) gains what the equation of the finer (y, x) adds."""
-    share = (1.0 if y == 2 * I - 1 else 0.5) * (1.0 if x == 2 * J - 1 else 0.5)
-    for d in range(9):
-        if nine[d] == 0:
-            continue
-        i, j = y + d // 3 - 1, x + d % 3 - 1
-        between_rows, between_columns = (i + 1) & 1, (j + 1) & 1
-        link = nine[d] * share * (0.5 if between_rows else 1.0) * (0.5 if between_columns else 1.0)
-        for a in range(between_rows + 1):
-            for b in range(between_columns + 1):
-                row[((i + 1) // 2 + a - I + 1) * 3 + (j + 1) // 2 + b - J + 1] += link
+def _node_equation(stencils, k, m, equation):
+    """The entries [3, 3] of a node's equation."""
+    equation[0, 0], equation[0, 1] = stencils[4, k - m - ONE], stencils[3, k - m]
+    equation[0, 2], equation[1, 0] = stencils[2, k - m + ONE], stencils[1, k - ONE]
+    equation[1, 1], equation[1, 2] = stencils[0, k], stencils[1, k]
+    equation[2, 0], equation[2, 1], equation[2, 2] = stencils[2, k], stencils[3, k], stencils[4, k]
 
 
 @kernel

@@ -6,7 +6,8 @@ its right-hand side is the mismatch along the rim. `multigrid.py` solves it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -88,15 +89,14 @@ def solve_hole(
     """As `solve_poisson`, for large images with small holes: only the hole's pixels are made and returned."""
     hole = np.asarray(hole, bool)
     window = _window(hole)
-    inside, shape = hole[window], hole.shape
 
     def cut(array: np.ndarray | None) -> Any:
-        return None if array is None else np.asarray(array).reshape(*shape, -1)[window]
+        return None if array is None else np.asarray(array).reshape(*hole.shape, -1)[window]
 
-    flat_weight = None if weight is None else np.asarray(weight)[window]
-    task = _Task(inside, np.asarray(known, bool)[window], cut(values), cut(guidance), flat_weight, cut(anchor))
+    soft = None if weight is None else np.asarray(weight)[window]
+    task = _Task(hole[window], np.asarray(known, bool)[window], cut(values), cut(guidance), soft, cut(anchor))
     solution = _solve(task, settings)
-    return HoleSolution(solution.values.reshape(-1, *np.shape(values)[2:]), solution.iterations, solution.unanchored)
+    return replace(solution, values=solution.values.reshape(-1, *np.shape(values)[2:]))
 
 
 def _window(hole: np.ndarray) -> tuple[Any, ...]:
@@ -129,7 +129,7 @@ class _Task(NamedTuple):
 
 
 class _Ties(NamedTuple):
-    """What unknowns gain in their equations, beside the differences to their neighbours in the hole."""
+    """What equations hold beside the differences between neighbours in the hole."""
 
     unknowns: np.ndarray  # [T] int64
     strengths: np.ndarray  # [T] float64, on the diagonal
@@ -152,7 +152,12 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     if task.guidance is not None and not _take(task.guidance, runs, result):
         absent = ~np.isfinite(result)
         result[absent] = 0
-    ties = _tie(task, kind, rim, result, absent)
+    found = [_known_ties(task, rim, result, absent)]
+    if task.weight is not None:
+        found.append(_soft_ties(task, task.weight, result))
+    if absent is not None:
+        found += _flat_ties(kind, result, absent)
+    ties = _Ties(*(np.concatenate(arrays) for arrays in zip(*found)))
     run = np.searchsorted(runs[:, 3], ties.unknowns, "right") - 1
     part = parts[run]
     strength = np.bincount(part, ties.strengths, parts.max() + 1)
@@ -184,35 +189,40 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     return HoleSolution(result, most, np.zeros(count, bool))
 
 
-def _tie(task: _Task, kind: np.ndarray, rim: np.ndarray, start: np.ndarray, absent: np.ndarray | None) -> _Ties:
-    """Known neighbours, anchors, and pairs that want no gradient for lack of guidance."""
+def _known_ties(task: _Task, rim: np.ndarray, start: np.ndarray, absent: np.ndarray | None) -> _Ties:
+    """To known neighbours that are finite."""
     unknowns, rows, columns = rim.T
     known = task.values[rows - 1, columns - 1].astype(np.float64)
-    sound = np.isfinite(known).all(1)
-    if not sound.all():
+    if not np.isfinite(known).all():
+        sound = np.isfinite(known).all(1)
         unknowns, rows, columns, known = unknowns[sound], rows[sound], columns[sound], known[sound]
     amounts = known - start[unknowns]
     if task.guidance is not None:
         beyond = task.guidance[rows - 1, columns - 1]
-        follow = np.isfinite(beyond) if absent is None else np.isfinite(beyond) & ~absent[unknowns]
-        amounts = np.where(follow, known - beyond, amounts)
-    found = [_Ties(unknowns, np.ones(len(unknowns)), amounts)]
-    if task.weight is not None:
-        weight = task.weight[task.hole].astype(np.float64)
-        anchor = np.zeros(start.shape) if task.anchor is None else task.anchor[task.hole].astype(np.float64)
-        unknowns = np.flatnonzero((weight > LEAST_WEIGHT) & np.isfinite(weight) & np.isfinite(anchor).all(1))
-        pull = np.minimum(weight[unknowns], MOST_WEIGHT)
-        found.append(_Ties(unknowns, pull, pull[:, None] * (anchor[unknowns] - start[unknowns])))
-    if absent is not None:
-        index = np.full(kind.shape, -1)
-        index[kind == HOLE] = np.arange(len(start))
-        for neighbour in (np.roll(index, -1, 0), np.roll(index, -1, 1)):
-            p, q = (a[(index >= 0) & (neighbour >= 0)] for a in (index, neighbour))
-            step = np.where(absent[p] | absent[q], start[q].astype(np.float64) - start[p], 0)
-            needed = step.any(1)
-            p, q, step = p[needed], q[needed], step[needed]
-            found += [_Ties(p, np.zeros(len(p)), step), _Ties(q, np.zeros(len(q)), -step)]
-    return _Ties(*(np.concatenate(arrays) for arrays in zip(*found)))
+        wanted = np.isfinite(beyond) if absent is None else np.isfinite(beyond) & ~absent[unknowns]
+        amounts = np.where(wanted, known - beyond, amounts)
+    return _Ties(unknowns, np.ones(len(unknowns)), amounts)
+
+
+def _soft_ties(task: _Task, weight: np.ndarray, start: np.ndarray) -> _Ties:
+    """To anchors."""
+    pull = weight[task.hole].astype(np.float64)
+    anchor = np.zeros(start.shape) if task.anchor is None else task.anchor[task.hole].astype(np.float64)
+    unknowns = np.flatnonzero((pull > LEAST_WEIGHT) & np.isfinite(pull) & np.isfinite(anchor).all(1))
+    pull = np.minimum(pull[unknowns], MOST_WEIGHT)
+    return _Ties(unknowns, pull, pull[:, None] * (anchor[unknowns] - start[unknowns]))
+
+
+def _flat_ties(kind: np.ndarray, start: np.ndarray, absent: np.ndarray) -> Iterator[_Ties]:
+    """Pairs of which one has no guidance want no gradient, not the one that `start` has there."""
+    index = np.full(kind.shape, -1)
+    index[kind == HOLE] = np.arange(len(start))
+    for neighbour in (np.roll(index, -1, 0), np.roll(index, -1, 1)):
+        p, q = (a[(index >= 0) & (neighbour >= 0)] for a in (index, neighbour))
+        step = np.where(absent[p] | absent[q], start[q].astype(np.float64) - start[p], 0)
+        used = step.any(1)
+        yield _Ties(p[used], np.zeros(used.sum()), step[used])
+        yield _Ties(q[used], np.zeros(used.sum()), -step[used])
 
 
 def _settle(
