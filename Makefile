@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -31,7 +31,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface
+bench: bench-raster bench-surface bench-poisson
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -40,6 +40,9 @@ bench-raster: $(READY)
 
 bench-surface: $(READY)
 	$(BIN)/python scripts/bench_surface.py $(DATA)
+
+bench-poisson: $(READY)
+	$(BIN)/python scripts/bench_poisson.py
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
