@@ -1,0 +1,148 @@
+"""What other views measured of the surface behind the object, and what they see past (METHOD section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from ..threads import parallel_map
+from .layers import steps
+from .masks import ViewMasks
+
+
+@dataclass(frozen=True)
+class DepthEvidenceSettings:
+    """Depths and disparities relative, lengths in pixels."""
+
+    unchanged: float = 0.01  # a view sees the background where removing the object moves its first surface by less
+    solid: float = 0.9  # alpha from which a surface counts as there
+    margin: int = 1  # px kept from what does not count
+    step: float = 0.06  # a depth edge: which pixel has which depth is not certain there
+    agreement: float = 0.03  # samples of one pixel that lie closer are of one surface
+    least_views: int = 2  # that must agree on a surface, or on there being none
+    full: int = 4  # samples that make a pixel as sure as one of the reference's own
+    beyond: float = 0.03  # how far behind a point a view must see to see past it
+    push: float = 0.01  # step by which a contradicted surface is pushed back
+    pushes: int = 60  # at most
+
+
+@dataclass(frozen=True)
+class DepthEvidence:
+    """Soft data in the reference's hole."""
+
+    disparity: np.ndarray  # [H, W] float32, 0 = none
+    weight: np.ndarray  # [H, W] float32 in [0, 1], 0 = none
+
+
+def gather_depth_evidence(
+    view: ViewMasks,  # the reference
+    views: Sequence[ViewMasks],  # the others; the reference among them does not count
+    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+) -> DepthEvidence:
+    """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
+
+    Taken are the pixels of other views whose first surface is there with and without the object, off depth edges. They
+    are carried into the reference; the samples of a pixel fall into groups that agree, and the nearest group of enough
+    samples gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
+    """
+    others = [v for v in views if v.camera.id != view.camera.id]
+    samples = parallel_map(lambda v: _samples(v, view, settings), others)
+    h, w = view.target.shape
+    found, count = np.zeros(h * w), np.zeros(h * w)
+    pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
+    if len(pixels):
+        order = np.lexsort((-disparities, pixels))
+        pixels, disparities = pixels[order].astype(int), disparities[order]
+        apart = (np.diff(pixels) > 0) | (disparities[1:] < (1 - settings.agreement) * disparities[:-1])
+        start = np.flatnonzero(np.r_[True, apart])
+        size = np.diff(np.r_[start, len(pixels)])
+        start, size = start[size >= settings.least_views], size[size >= settings.least_views]
+        taken, first = np.unique(pixels[start], return_index=True)
+        found[taken] = disparities[start + size // 2][first]
+        count[taken] = size[first]
+    found, count = found.reshape(h, w), count.reshape(h, w)
+    nearest = cv2.dilate(found, np.ones((5, 5), np.uint8))
+    count[found < (1 - settings.step) * nearest] = 0
+    weight = np.minimum(count / settings.full, 1)
+    return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
+
+
+def _samples(other: ViewMasks, view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
+    """[2, M]: pixels of the reference's hole (flat indices) and the disparities that a view measured there."""
+    rows, cols = np.nonzero(_background(other, settings))
+    uv = np.stack([cols + 0.5, rows + 0.5], -1)
+    points = other.camera.unproject(uv, other.depth_before[rows, cols].astype(np.float64))
+    _, cols, rows, z = _framed(view.camera, points)
+    there = view.target[rows, cols]
+    return np.stack([rows[there] * view.target.shape[1] + cols[there], 1 / z[there]])
+
+
+def _background(view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface is not the object's, off depth edges."""
+    depth = view.depth_before
+    there = (depth > 0) & (view.alpha_after > settings.solid)
+    same = there & (np.abs(view.depth_after - depth) <= settings.unchanged * depth)
+    disparity = np.divide(1, depth, out=np.zeros_like(depth), where=there)
+    doubtful = there & ~same | steps(disparity, there, settings.step)
+    return same & (cv2.dilate(doubtful.astype(np.uint8), np.ones((2 * settings.margin + 1,) * 2, np.uint8)) == 0)
+
+
+def _framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(indices, cols, rows, z) of the points that lie in a view's frame."""
+    uv, z = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    cols, rows = uv[inside].astype(int).T
+    return np.flatnonzero(inside), cols, rows, z[inside]
+
+
+def seen_past(
+    camera: Camera,  # the reference
+    depth: np.ndarray,  # [H, W] its completed z-depth
+    pixels: np.ndarray,  # [H, W] bool, those asked about
+    views: Sequence[ViewMasks],
+    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+) -> np.ndarray:
+    """[H, W] bool: pixels whose completed surface stands where other views see through (free space).
+
+    A view sees past a point if all it sees round its pixel lies clearly behind. Enough views must, and more than see a
+    surface at the point. What a view sees nothing of (alpha below ½) says nothing.
+    """
+    rows, cols = np.nonzero(pixels & (depth > 0))
+    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
+    past, there = np.zeros(len(points), int), np.zeros(len(points), int)
+    for view in views:
+        if view.camera.id == camera.id:
+            continue
+        index, x, y, z = _framed(view.camera, points)
+        nearest = cv2.erode(view.depth_before, np.ones((3, 3), np.uint8))[y, x]  # 0 where anything is void
+        farthest = cv2.dilate(view.depth_before, np.ones((3, 3), np.uint8))[y, x]
+        past[index] += nearest > (1 + settings.beyond) * z
+        there[index] += (nearest <= (1 + settings.beyond) * z) & (farthest >= (1 - settings.beyond) * z)
+    found = np.zeros(pixels.shape, bool)
+    found[rows, cols] = (past >= settings.least_views) & (past > there)
+    return found
+
+
+def pushed_back(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] completed z-depth
+    contradicted: np.ndarray,  # [H, W] bool
+    views: Sequence[ViewMasks],
+    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+) -> np.ndarray:
+    """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
+
+    0 where there is no such place within reach.
+    """
+    moved, left = depth.astype(np.float64), contradicted
+    for _ in range(settings.pushes):
+        if not left.any():
+            break
+        moved = np.where(left, moved * (1 + settings.push), moved)
+        left = seen_past(camera, moved, left, views, settings)
+    return np.where(left, 0.0, moved).astype(np.float32)
