@@ -83,9 +83,9 @@ def relative_disparity(
 ) -> np.ndarray:
     """[H, W] float32 disparity of any scale and shift, NaN = no value.
 
-    Metric depth is inverted. Affine depth m has an unknown scale and shift *in depth*, so 1/m would be bent: z = a·m + b
-    is fitted to the scene's depth first (relative errors, reweighted by Tukey's biweight), then inverted. A fit with
-    a ≤ 0 is none; −m then stands for the disparity, so that the ring shows the prior not to agree.
+    Metric depth is inverted. Affine depth m has an unknown scale and shift *in depth*, so 1/m would be bent:
+    z = a·m + b is fitted to the scene's depth first (relative errors, reweighted by Tukey's biweight), then inverted.
+    A fit with a ≤ 0 is none; −m then stands for the disparity, so that the ring shows the prior not to agree.
     """
     m = prior.values
     if prior.kind == "disparity":

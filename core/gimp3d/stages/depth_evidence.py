@@ -26,8 +26,9 @@ class DepthEvidenceSettings:
     least_views: int = 2  # that must agree on a surface, or on there being none
     full: int = 4  # samples that make a pixel as sure as one of the reference's own
     beyond: float = 0.03  # how far behind a point a view must see to see past it
-    push: float = 0.01  # step by which a contradicted surface is pushed back
-    pushes: int = 60  # at most
+    coarse: int = 4  # stride at which it is asked which parts of a view may show the hole
+    push: float = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
+    pushes: int = 40  # at most: to 50 times the distance
 
 
 @dataclass(frozen=True)
@@ -73,12 +74,33 @@ def gather_depth_evidence(
 
 def _samples(other: ViewMasks, view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
     """[2, M]: pixels of the reference's hole (flat indices) and the disparities that a view measured there."""
-    rows, cols = np.nonzero(_background(other, settings))
-    uv = np.stack([cols + 0.5, rows + 0.5], -1)
-    points = other.camera.unproject(uv, other.depth_before[rows, cols].astype(np.float64))
+    width = view.target.shape[1]
+    rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))
+    points = other.camera.unproject(
+        np.stack([cols + 0.5, rows + 0.5], -1), other.depth_before[rows, cols].astype(float)
+    )
     _, cols, rows, z = _framed(view.camera, points)
-    there = view.target[rows, cols]
-    return np.stack([rows[there] * view.target.shape[1] + cols[there], 1 / z[there]])
+    front = view.depth_before[rows, cols]  # nothing of the background lies before what the reference itself sees
+    there = view.target[rows, cols] & (z > (1 - settings.beyond) * front)
+    return np.stack([rows[there] * width + cols[there], 1 / z[there]])
+
+
+def _may_reach(other: ViewMasks, view: ViewMasks, stride: int) -> np.ndarray:
+    """[H, W] bool: blocks of a view that may show something of the reference's hole; most do not, which saves time."""
+    coarse = other.depth_before[stride // 2 :: stride, stride // 2 :: stride]
+    rows, cols = np.nonzero(coarse > 0)
+    uv = (np.stack([cols, rows], -1) + 0.5) * stride
+    inside, x, y, _ = _framed(view.camera, other.camera.unproject(uv, coarse[rows, cols].astype(float)))
+    near_hole = cv2.dilate(view.target.astype(np.uint8), np.ones((8 * stride + 1,) * 2, np.uint8)) > 0
+    found = np.zeros(coarse.shape, np.uint8)
+    found[rows[inside], cols[inside]] = near_hole[y, x]
+    found = cv2.dilate(found, np.ones((3, 3), np.uint8))
+    return (
+        np.kron(np.pad(found, ((0, 1), (0, 1)), "edge"), np.ones((stride, stride), np.uint8))[
+            : other.target.shape[0], : other.target.shape[1]
+        ]
+        > 0
+    )
 
 
 def _background(view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
@@ -101,35 +123,38 @@ def _framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 def seen_past(
-    camera: Camera,  # the reference
+    view: ViewMasks,  # the reference
     depth: np.ndarray,  # [H, W] its completed z-depth
     pixels: np.ndarray,  # [H, W] bool, those asked about
     views: Sequence[ViewMasks],
     settings: DepthEvidenceSettings = DepthEvidenceSettings(),
 ) -> np.ndarray:
-    """[H, W] bool: pixels whose completed surface stands where other views see through (free space).
+    """[H, W] bool: pixels whose completed surface stands where views see through (free space).
 
-    A view sees past a point if all it sees round its pixel lies clearly behind. Enough views must, and more than see a
-    surface at the point. What a view sees nothing of (alpha below ½) says nothing.
+    The reference itself sees the object there, and nothing in front of it. Another view sees past a point if all it
+    sees round its pixel lies clearly behind. Enough others must, and more than see a surface at the point. Where a
+    view sees nothing (alpha below ½), it says nothing.
     """
     rows, cols = np.nonzero(pixels & (depth > 0))
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
+    z = depth[rows, cols].astype(np.float64)
+    points = view.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
     past, there = np.zeros(len(points), int), np.zeros(len(points), int)
-    for view in views:
-        if view.camera.id == camera.id:
+    for other in views:
+        if other.camera.id == view.camera.id:
             continue
-        index, x, y, z = _framed(view.camera, points)
-        nearest = cv2.erode(view.depth_before, np.ones((3, 3), np.uint8))[y, x]  # 0 where anything is void
-        farthest = cv2.dilate(view.depth_before, np.ones((3, 3), np.uint8))[y, x]
-        past[index] += nearest > (1 + settings.beyond) * z
-        there[index] += (nearest <= (1 + settings.beyond) * z) & (farthest >= (1 - settings.beyond) * z)
+        index, x, y, far = _framed(other.camera, points)
+        nearest = cv2.erode(other.depth_before, np.ones((3, 3), np.uint8))[y, x]  # 0 where anything is void
+        farthest = cv2.dilate(other.depth_before, np.ones((3, 3), np.uint8))[y, x]
+        past[index] += nearest > (1 + settings.beyond) * far
+        there[index] += (nearest <= (1 + settings.beyond) * far) & (farthest >= (1 - settings.beyond) * far)
     found = np.zeros(pixels.shape, bool)
-    found[rows, cols] = (past >= settings.least_views) & (past > there)
+    before_object = z < (1 - settings.beyond) * view.depth_before[rows, cols]
+    found[rows, cols] = before_object | ((past >= settings.least_views) & (past > there))
     return found
 
 
 def pushed_back(
-    camera: Camera,
+    view: ViewMasks,  # the reference
     depth: np.ndarray,  # [H, W] completed z-depth
     contradicted: np.ndarray,  # [H, W] bool
     views: Sequence[ViewMasks],
@@ -137,12 +162,12 @@ def pushed_back(
 ) -> np.ndarray:
     """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
 
-    0 where there is no such place within reach.
+    0 elsewhere, and where there is no such place within reach.
     """
-    moved, left = depth.astype(np.float64), contradicted
-    for _ in range(settings.pushes):
+    moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
+    for k in range(settings.pushes):
         if not left.any():
             break
-        moved = np.where(left, moved * (1 + settings.push), moved)
-        left = seen_past(camera, moved, left, views, settings)
+        moved = np.where(left, moved * (1 + settings.push * 1.1**k), moved)
+        left = seen_past(view, moved, left, views, settings)
     return np.where(left, 0.0, moved).astype(np.float32)

@@ -22,6 +22,8 @@ class LayerSettings:
     band: int = 4  # width of the ring on which layers are told apart
     least: float = 0.1  # share of the rim that a layer must hold to reach into the hole
     occluder_share: float = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
+    reach: int = 24  # width of the ring in which a surface in front of the object is followed
+    front_share: float = 0.05  # of a part of that ring that must be seen to be in front
     straight: float = 0.97  # share of two layers' ring pixels that a line must part for it to be their border
 
 
@@ -81,6 +83,28 @@ def background_rim(
         upper = disparity > (top + bottom) / 2
     edge = edges & scipy.ndimage.binary_dilation(front, AROUND, iterations=2) & upper
     return known & ~front & ~edge
+
+
+def without_front(
+    disparity: np.ndarray,  # [H, W]
+    known: np.ndarray,  # [H, W] bool
+    hole: np.ndarray,  # [H, W] bool
+    front: np.ndarray,  # [H, W] bool, pixels seen to lie in front of the object, at its outline
+    settings: LayerSettings = LayerSettings(),
+) -> np.ndarray:
+    """[H, W] bool: the known pixels without the surfaces that hide the object itself: they bound nothing behind it.
+
+    A part of the ring, cut at steps, goes if enough of it is front.
+    """
+    if not (front & known).any():
+        return known
+    ring = known & (distance_to(hole) <= settings.reach)
+    labels, _ = scipy.ndimage.label(ring & ~steps(disparity, known, settings.step), AROUND)
+    size, marked = np.bincount(labels.ravel()), np.bincount(labels[front], minlength=labels.max() + 1)
+    gone = marked >= settings.front_share * size
+    gone[0] = False
+    edge = ring & (labels == 0) & (front | scipy.ndimage.binary_dilation(gone[labels], AROUND, iterations=2))
+    return known & ~gone[labels] & ~edge
 
 
 def separated(
