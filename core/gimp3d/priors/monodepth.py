@@ -40,10 +40,10 @@ def depth_prior(
 ) -> DepthPrior | None:
     """The prior that `spec` names, of the view's size, or None where the scene alone decides.
 
-    A file holds disparity unless it is said to hold depth: .npy, or any picture that OpenCV reads with one channel of
-    8, 16 or 32 bits. It may have another resolution than the view, not another shape. A model is run by OpenCV on the
-    view, squeezed to the size that the model declares (else the one given after its path, else 518×518) and normalised
-    by ImageNet's mean and deviation; its first output of two long axes is resized back.
+    A file holds disparity unless it is said to hold depth (0 = no value): .npy, or any picture that OpenCV reads with
+    one channel of 8, 16 or 32 bits. It may have another resolution than the view, not another shape. A model is run by
+    OpenCV on the view, squeezed to the size that the model declares (else the one given after its path, else 518×518)
+    and normalised by ImageNet's mean and deviation; its first output of two long axes is resized back.
 
     Raises
     ------
@@ -63,14 +63,14 @@ def depth_prior(
         path, kind = rest, "disparity"
     if name == "file":
         values = _from_file(Path(path), height, width)
+        if kind != "disparity":
+            values = np.where(values == 0, np.nan, values)
     else:
         if image is None:
             raise BadInput("--depth-prior onnx: there is no picture to look at")
         values = _from_model(Path(path), image, (int(size[1]), int(size[2])) if size else None)
     if not np.isfinite(values).any():
         raise BadInput(f"--depth-prior: {path} gives no finite value")
-    if kind != "disparity":
-        values = np.where(np.isfinite(values) & ((kind == "depth") | (values > 0)), values, np.nan)
     if values.shape != (height, width):
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
     return DepthPrior(values.astype(np.float32), kind)

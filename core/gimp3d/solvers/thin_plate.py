@@ -20,10 +20,10 @@ import scipy.sparse.linalg
 class ThinPlateSettings:
     """How stiff the plate is."""
 
-    smoothing: float = 1.8  # px, σ below which the values' own noise is smoothed away
+    smoothing: float = 1.5  # px, σ below which the values' own noise is smoothed away
     tension: float = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
     unknowns: int = 4000  # at most; larger domains are solved on a coarser grid
-    reweighted: int = 2  # rounds of Tukey's biweight against outliers
+    reweighted: int = 1  # rounds of Tukey's biweight against outliers
     outlier: float = 4.7  # standard deviations at which a value does not count (95 % efficiency)
 
 
@@ -35,9 +35,9 @@ def thin_plate(
 ) -> np.ndarray:
     """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
 
-    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u|²/ℓ²) over wanted pixels and those of weight > 0
-    (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a sparse factorisation. Parts
-    of the domain without a value are NaN.
+    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²) over wanted pixels and those of weight > 0,
+    s the values' common slope (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a
+    sparse factorisation. Parts of the domain without a value are NaN.
     """
     wanted, weight = np.asarray(wanted, bool), np.asarray(weight, np.float64)
     domain = wanted | (weight > 0)
@@ -46,9 +46,11 @@ def thin_plate(
         return result
     window = _window(domain)
     domain, weight = domain[window], weight[window]
+    # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
+    trend = _slope(values[window], weight)
     stride = int(np.ceil(np.sqrt(domain.sum() / settings.unknowns)))
     count = _cells(weight, stride)
-    mean = _cells(np.where(weight > 0, values[window], 0.0) * weight, stride) / np.where(count > 0, count, 1)
+    mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
     cells = _cells(domain.astype(np.float64), stride) > 0
     parts, _ = scipy.ndimage.label(cells)
     cells &= np.isin(parts, parts[count > 0])
@@ -61,13 +63,23 @@ def thin_plate(
         robust = count * _biweight(coarse - mean, count > 0, settings.outlier)
     fine = _refined(coarse, cells, stride)[: domain.shape[0], : domain.shape[1]]
     inside = domain & np.repeat(np.repeat(cells, stride, 0), stride, 1)[: domain.shape[0], : domain.shape[1]]
-    result[window] = np.where(inside, fine, np.nan)
+    result[window] = np.where(inside, fine + trend, np.nan)
     return result
 
 
 def _window(domain: np.ndarray) -> tuple[slice, slice]:
     rows, cols = np.flatnonzero(domain.any(1)), np.flatnonzero(domain.any(0))
     return slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
+
+
+def _slope(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The plane [H, W] through the values, by least squares."""
+    rows, cols = np.nonzero(weight > 0)
+    share = np.sqrt(weight[rows, cols])
+    points = np.stack([rows, cols, np.ones(len(rows))], -1)
+    plane = np.linalg.lstsq(points * share[:, None], values[rows, cols] * share, rcond=None)[0]
+    y, x = np.indices(values.shape)
+    return plane[0] * y + plane[1] * x + plane[2]
 
 
 def _cells(values: np.ndarray, stride: int) -> np.ndarray:

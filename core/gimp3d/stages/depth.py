@@ -17,7 +17,6 @@ from .depth_fill import DepthSettings, Surroundings, choose_plan, fill, surround
 from .layers import AROUND, distance_to, without_front
 from .masks import ViewMasks
 
-NO_RIM = "a part of the hole has no rim"
 SHOWN = 1500  # pairs of gradients kept for the fit's picture
 
 __all__ = ["DepthCompletion", "DepthSettings", "PriorFit", "complete_depth", "complete_disparity", "fit_prior"]
@@ -129,7 +128,7 @@ def complete_disparity(
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
-        return _completion(scene, hole, PriorFit(0.0, 0.0, 1.0, "nothing to fill"), np.ones(hole.shape), 0)
+        return _completion(scene, PriorFit(0.0, 0.0, 1.0, "nothing to fill"), np.ones(hole.shape), 0)
     weight = np.zeros(hole.shape)
     if evidence is not None:
         usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
@@ -142,8 +141,9 @@ def complete_disparity(
     if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     result, trust = scene.copy(), np.ones(hole.shape)
-    clamped = 0
-    words: list[str] = []
+    done: list[_Settled] = []
+    most_sure = fit.confidence
+    reasons: list[str] = [fit.reason]
     for part in _parts(hole, settings.small_part):
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = _window(part, settings.planes.ring + 1) if near else np.s_[:, :]
@@ -151,16 +151,19 @@ def complete_disparity(
         own_guide = None if guide is None else guide[window]
         around = surroundings(scene[window], trusted[window], inside, (weight * part)[window], settings, own_guide)
         surface = "harmonic" if part.sum() <= settings.small_part else settings.surface
-        plan = choose_plan(around, replace(settings, surface=surface), insist=not words)
+        plan = choose_plan(around, replace(settings, surface=surface), insist=not done)
         missed = withheld_miss(around, plan, settings, around.rim)
-        settled = _settle(fill(around, plan, settings), around, plan.reason, fit.shift, settings)
+        settled = _settle(fill(around, plan, settings), around, fit.shift, settings)
         result[window][inside] = settled.disparity[inside]
         trust[window][inside] = (settled.share * fit.confidence * _trust(around, missed, settings))[inside]
-        clamped += settled.clamped
-        words.append(settled.reason)
-    about = [fit.reason, words[0], *(w for w in words[1:] if NO_RIM in w)]
-    reason = "; ".join(w for w in dict.fromkeys(about) if w)
-    return _completion(result, hole, replace(fit, reason=reason), trust, clamped)
+        reasons += [*([] if done else [plan.reason]), *settled.notes]
+        done.append(settled)
+        if part.sum() > 0.05 * hole.sum():
+            most_sure = min(most_sure, settled.share)
+    confidence = min(float(trust[hole].mean()), most_sure)
+    reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
+    clamped = sum(s.clamped for s in done)
+    return _completion(result, replace(fit, confidence=confidence, reason=reason), trust, clamped)
 
 
 def _without_gaps(prior: np.ndarray) -> np.ndarray:
@@ -249,20 +252,20 @@ class _Settled:
     disparity: np.ndarray  # [H, W]
     clamped: int
     share: float  # of the confidence that is left
-    reason: str
+    notes: list[str]
 
 
-def _settle(filled: np.ndarray, around: Surroundings, reason: str, shift: float, settings: DepthSettings) -> _Settled:
+def _settle(filled: np.ndarray, around: Surroundings, shift: float, settings: DepthSettings) -> _Settled:
     """Every pixel decided and kept to the ring's range."""
-    share = 1.0
+    share, notes = 1.0, []
     undecided = around.hole & ~np.isfinite(filled)
     if undecided.any() and around.guide is not None:
         filled, share = np.where(undecided, around.guide + shift, filled), 0.5
-        reason = f"{NO_RIM}: the prior as aligned used"
+        notes.append("a part of the hole has no rim: the prior used as it is aligned")
     elif undecided.any():
         nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
         filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
-        reason = f"{reason}; {NO_RIM}: nearest depth used" if reason else f"{NO_RIM}: nearest depth used"
+        notes.append("a part of the hole has no rim: nearest depth used")
     ring = around.measured & (around.distance <= settings.layers.band)
     beside = around.disparity[ring if ring.any() else around.measured]
     finite = beside[beside > 0]
@@ -272,19 +275,16 @@ def _settle(filled: np.ndarray, around: Surroundings, reason: str, shift: float,
         low = 0.0
     clamped = int((around.hole & ((filled < low) | (filled > high))).sum())
     if clamped > 0.05 * around.hole.sum():
-        share, reason = 0.5 * share, f"{reason}; {clamped} pixels clamped to the ring's range"
-    return _Settled(np.clip(filled, low, high), clamped, share, reason)
+        share *= 0.5
+        notes.append(f"{clamped} pixels clamped to the ring's range")
+    return _Settled(np.clip(filled, low, high), clamped, share, notes)
 
 
-def _completion(
-    disparity: np.ndarray, hole: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int
-) -> DepthCompletion:
+def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int) -> DepthCompletion:
     disparity = disparity.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
-    confidence = float(trust[hole].mean()) if hole.any() else fit.confidence
-    return DepthCompletion(
-        disparity, depth, trust.astype(np.float32), fit.scale, fit.gradients, clamped, 0, confidence, fit.reason
-    )
+    trust = trust.astype(np.float32)
+    return DepthCompletion(disparity, depth, trust, fit.scale, fit.gradients, clamped, 0, fit.confidence, fit.reason)
 
 
 def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:

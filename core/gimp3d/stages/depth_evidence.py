@@ -24,7 +24,7 @@ class DepthEvidenceSettings:
     step: float = 0.06  # a depth edge: which pixel has which depth is not certain there
     agreement: float = 0.03  # samples of one pixel that lie closer are of one surface
     least_views: int = 2  # that must agree on a surface, or on there being none
-    full: int = 4  # samples that make a pixel as sure as one of the reference's own
+    full: int = 4  # views that make a pixel as sure as one of the reference's own
     beyond: float = 0.03  # how far behind a point a view must see to see past it
     coarse: int = 4  # stride at which it is asked which parts of a view may show the hole
     push: float = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
@@ -48,23 +48,25 @@ def gather_depth_evidence(
 
     Taken are the pixels of other views whose first surface is there with and without the object, off depth edges. They
     are carried into the reference; the samples of a pixel fall into groups that agree, and the nearest group of enough
-    samples gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
+    views gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
     """
     others = [v for v in views if v.camera.id != view.camera.id]
     samples = parallel_map(lambda v: _samples(v, view, settings), others)
     h, w = view.target.shape
     found, count = np.zeros(h * w), np.zeros(h * w)
     pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
+    origin = np.repeat(np.arange(len(samples)), [s.shape[1] for s in samples])
     if len(pixels):
         order = np.lexsort((-disparities, pixels))
-        pixels, disparities = pixels[order].astype(int), disparities[order]
+        pixels, disparities, origin = pixels[order].astype(int), disparities[order], origin[order]
         apart = (np.diff(pixels) > 0) | (disparities[1:] < (1 - settings.agreement) * disparities[:-1])
         start = np.flatnonzero(np.r_[True, apart])
-        size = np.diff(np.r_[start, len(pixels)])
-        start, size = start[size >= settings.least_views], size[size >= settings.least_views]
-        taken, first = np.unique(pixels[start], return_index=True)
-        found[taken] = disparities[start + size // 2][first]
-        count[taken] = size[first]
+        group = np.cumsum(np.r_[0, apart])
+        agreeing = np.bincount(np.unique(group * len(samples) + origin) // len(samples), minlength=len(start))
+        middle = disparities[start + np.bincount(group) // 2]
+        enough = agreeing >= settings.least_views
+        taken, first = np.unique(pixels[start[enough]], return_index=True)
+        found[taken], count[taken] = middle[enough][first], agreeing[enough][first]
     found, count = found.reshape(h, w), count.reshape(h, w)
     nearest = cv2.dilate(found, np.ones((5, 5), np.uint8))
     count[found < (1 - settings.step) * nearest] = 0

@@ -183,7 +183,13 @@ def _continued(around: Surroundings, layer: _Layer, own: np.ndarray, kind: str, 
     near = layer.on & (around.distance <= settings.plate_ring)
     clean = near & ((around.distance >= settings.skin) | around.hole)
     taken = clean if clean.sum() >= settings.minimum_ring else near
-    return guide + thin_plate(values, weight * taken, own | near, settings.plate)
+    plate = thin_plate(values, weight * taken, own | near, settings.plate)
+    if not (weight * own).any():
+        return guide + plate
+    # What only other views saw, a mound or a ledge, is an outlier to the plate; a membrane leads there and back.
+    lacking = np.where(around.hole, values - plate, 0.0)
+    rest = solve_poisson(own, layer.on & around.rim, lacking, weight=weight * own, anchor=lacking).values
+    return guide + plate + np.nan_to_num(rest)
 
 
 def _deviation(

@@ -132,7 +132,8 @@ def separated(
 def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, settings: LayerSettings) -> bool:
     """Whether two parts differ clearly where they come near each other; parts that do not come near are not parted.
 
-    Each part's plane there is continued to the other part, so that a slope across a gap is no step.
+    Each part's plane there is continued to the other part and half way to it: a slope across a gap is no step, nor are
+    two slopes that meet in it.
     """
     reach = np.ones((15, 15), np.uint8)
     near = [p & (cv2.dilate(q.astype(np.uint8), reach) > 0) for p, q in ((a, b), (b, a))]
@@ -140,12 +141,11 @@ def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, settings: Laye
         return False
     points = [np.stack([*np.nonzero(p), np.ones(p.sum())], -1) for p in near]
     values = [disparity[p] for p in near]
-    apart = []
-    for here, there in ((0, 1), (1, 0)):
-        plane = np.linalg.lstsq(points[here], values[here], rcond=None)[0]
-        apart.append(abs(float(np.median(points[there] @ plane - values[there]))))
+    planes = [np.linalg.lstsq(p, v, rcond=None)[0] for p, v in zip(points, values)]
+    places = [points[0].mean(0), points[1].mean(0), (points[0].mean(0) + points[1].mean(0)) / 2]
+    apart = min(abs(float(place @ (planes[0] - planes[1]))) for place in places)
     level = abs(float(np.median(values[0])) - float(np.median(values[1])))
-    return min(*apart, level) > settings.step * max(float(np.median(v)) for v in values)
+    return min(apart, level) > settings.step * max(float(np.median(v)) for v in values)
 
 
 def divided(
@@ -164,7 +164,8 @@ def divided(
         return np.full(hole.shape, present[0] if len(present) else 0)
     if len(present) == 2:
         side = _straight_border(rings[present[0]], rings[present[1]], settings.straight)
-        if side is not None:
+        inside = hole & (seeds >= 0)
+        if side is not None and (side == (seeds == present[0]))[inside].sum() >= settings.straight * inside.sum():
             return np.where(side, present[0], present[1])
     votes = solve_poisson(hole & (seeds < 0), seeds >= 0, (seeds[..., None] == present).astype(np.float64)).values
     return present[np.nan_to_num(votes).argmax(-1)]
