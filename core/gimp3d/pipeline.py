@@ -34,6 +34,7 @@ from .stages.reference import (
     EvidenceSettings,
     ReferenceChoice,
     ReferenceSettings,
+    ViewScore,
     choose_reference,
     disparity_of,
     gather_evidence,
@@ -110,6 +111,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
+    references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
 
 
@@ -137,6 +139,7 @@ class _Run:
         self.stages: list[StageReport] = []
         self.warnings: list[str] = []
         self.pictures: list[Picture] = []
+        self.references: list[ReferenceChoice] = []
 
     def __call__(self, name: str, work: Callable[[], R], words: Callable[[R], tuple[float, str]] | None = None) -> R:
         self.progress(name, 0, 1)
@@ -247,6 +250,7 @@ def _fill_from_one_view(
     choice: ReferenceChoice = run(
         f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference)
     )
+    run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
     completed: DepthCompletion = run(
         f"depth{suffix}",
@@ -418,6 +422,7 @@ def _finish(
         views=len(masks.views),
         painted=painted,
         pictures=tuple(run.pictures),
+        references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
     )
 
@@ -429,6 +434,7 @@ STORED = (
     Masks,
     ViewMasks,
     ReferenceChoice,
+    ViewScore,
     DepthCompletion,
     MappingField,
     Propagation,

@@ -16,6 +16,7 @@ from .io.images import write_png
 from .job import write_atomically
 from .pipeline import Picture, RemovalResult, View, render_bytes
 from .stages.propagate import Rule
+from .stages.reference import ReferenceChoice
 
 RULE_COLOURS = {
     Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
@@ -23,6 +24,7 @@ RULE_COLOURS = {
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
+MOST_SCORES = 6  # views listed for each reference
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -58,7 +60,7 @@ def write_removal_report(
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
         stage_pictures.append((picture.title, name))
-    page = _page(summary, pairs, stage_pictures)
+    page = _page(summary, pairs, stage_pictures, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
 
@@ -126,7 +128,12 @@ def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.
     return np.where(there[..., None], colour, image // 2)
 
 
-def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictures: Sequence[tuple[str, str]]) -> str:
+def _page(
+    summary: dict[str, Any],
+    pairs: Sequence[tuple[str, str, str]],
+    pictures: Sequence[tuple[str, str]],
+    choices: Sequence[ReferenceChoice],
+) -> str:
     counts, text = summary["counts"], html.escape
     longest = max((s["seconds"] for s in summary["stages"]), default=1) or 1
     rows = "".join(
@@ -157,7 +164,29 @@ def _page(summary: dict[str, Any], pairs: Sequence[tuple[str, str, str]], pictur
         f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>{warnings}"
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
+        f"{_references(choices)}"
         f"<h2>What each stage saw</h2><p>{legend}</p><div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
     )
+
+
+def _references(choices: Sequence[ReferenceChoice]) -> str:
+    """Why each reference was chosen: the best views' scores as a table."""
+    tables = []
+    for choice in choices:
+        rows = "".join(
+            f"<tr><td>{'<b>' if s.camera_id == choice.camera_id else ''}{html.escape(s.camera_id)}</td>"
+            f"<td class=n>{s.score:.2f}</td>"
+            f"<td style='width:22%'><div class=bar style='width:{100 * s.score:.0f}%'></div></td>"
+            f"<td class=n>{s.covered:.0%}</td><td class=n>{s.facing:.2f}</td><td class=n>{s.detail:.0%}</td></tr>"
+            for k, s in enumerate(choice.scores)
+            if k < MOST_SCORES or s.camera_id == choice.camera_id
+        )
+        plan = ", ".join(f"{html.escape(name)} ({share:.0%})" for name, share in choice.plan)
+        tables.append(
+            "<table><tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
+            f"{rows}</table><p>{len(choice.scores)} candidates. Covered by the chosen view, then by the next best: "
+            f"{plan}</p>"
+        )
+    return f"<h2>Reference views</h2>{''.join(tables)}" if tables else ""

@@ -39,6 +39,8 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
     for name in pictures:
         assert read_image(tmp_path / name).size > 0
     assert "<script" not in page and "&lt;script&gt;" in page and "&lt;b&gt;" in page and "file:&lt;x&gt;" in page
+    choice = result.references[0]
+    assert f"<b>{choice.camera_id}" in page and f"{choice.scores[0].score:.2f}" in page
     assert not re.search(r"(src|href)='(https?:|//)", page)
 
 

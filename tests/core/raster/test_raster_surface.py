@@ -34,7 +34,7 @@ def tilted(degrees: float) -> np.ndarray:
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
-@pytest.mark.parametrize("degrees", [-60, -20, 0, 35, 70])
+@pytest.mark.parametrize("degrees", [-60, -20, 0, 35, 65])
 def test_a_flat_splat_is_met_where_the_ray_meets_its_plane(degrees: float) -> None:
     splat = with_scales(one(mean=(0.1, -0.2, 4.0)), [0.6, 0.6, 1e-4], tilted(degrees))
     thin = RasterSettings(low_pass=1e-4)  # the low-pass takes a little of a splat's slope: it is never infinitely thin
