@@ -17,7 +17,8 @@ from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
-from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
+from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from .stages.propagate import (
@@ -70,7 +71,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", support=0.0),
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         propagate=PropagateSettings(transfer="sample"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,
@@ -251,7 +252,10 @@ def _fill_from_one_view(
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
-    completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
+    completed: DepthCompletion = run(
+        f"depth{suffix}",
+        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given),
+    )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
@@ -317,12 +321,25 @@ def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearan
     return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
 
 
-def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
-    prior = depth_prior(settings.depth_prior, view.camera.height, view.camera.width)
-    surface = settings.depth_prior if settings.depth_prior in ("harmonic", "planar") else settings.depth.surface
+def _complete_depth(
+    view: ViewMasks,
+    open_views: Sequence[ViewMasks],
+    base: np.ndarray,
+    settings: RemovalSettings,
+    given: np.ndarray | None,
+) -> DepthCompletion:
+    """The reference's depth; a model that estimates it looks at the picture given, or at a first fill."""
+    picture, spec = None, settings.depth_prior
+    if spec.startswith("onnx:"):
+        if given is not None:
+            picture = paste_picture(base, view.target, given, "--reference-image").image
+        else:
+            picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
+    prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
+    surface = spec if spec in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
-    return complete_disparity(
-        disparity_of(view.depth_after), known, view.target, prior, replace(settings.depth, surface=surface)
+    return complete_depth(
+        view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)
     )
 
 

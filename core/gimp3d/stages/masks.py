@@ -274,7 +274,10 @@ def _measure_view(
 def _in_front(depth: np.ndarray, object_: np.ndarray, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels at the object's outline whose first surface lies clearly in front of it, and their rim."""
     size = 2 * settings.margin + 1
-    nearest = cv2.erode(np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32), np.ones((size, size)))
+    object_depth = np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32)
+    nearest = cv2.erode(
+        object_depth, np.ones((size, size)), borderType=cv2.BORDER_REPLICATE
+    )  # its own border is finite
     front = ~object_ & (depth > 0) & (depth < (1 - settings.occluder_step) * np.where(np.isfinite(nearest), nearest, 0))
     return cv2.dilate(front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
