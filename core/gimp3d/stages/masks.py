@@ -46,7 +46,7 @@ class MaskSettings:
     mode: str = "need"  # "need": only what no view shows; "paper": polygon minus guard footprints
     guard_scale: float = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
     guard_footprint: float = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
-    changed: float = 0.05  # blend weight of removed Gaussians above which the object touched a pixel
+    changed: float = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
     hides: float = 0.3  # blend weight of removed Gaussians above which a pixel shows nothing else
     solid: float = 0.9  # alpha after removal from which a surface counts as there
     void: float = 0.1  # alpha after removal below which there is nothing

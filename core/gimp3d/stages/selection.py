@@ -42,7 +42,7 @@ class SelectionSettings:
     mostly: float = 0.5  # share of its mass, or of its weight, that decides
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
     shown: float = 0.5  # weight below which a Gaussian shows nothing
-    support: float = 1.0  # of a Gaussian's weight on what no view saw, views must have shown so much; 0 keeps all
+    support: float = 0.1  # of a Gaussian's weight on what no view saw, views must have shown so much; 0 keeps all
     near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
     least_misfit: float = 0.1  # … and by so much, colours in [0, 1]
