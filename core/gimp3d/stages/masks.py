@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import cv2
@@ -11,13 +11,22 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..box import Box, Region
+from ..box import Region
 from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import contributions, footprint, render, surface_depth
 from ..threads import parallel_map
+from .outline import (
+    box_polygon,
+    cropped,
+    fill_polygon,
+    gaussians_window,
+    guard_gaussians,
+    surface_points,
+    window_round,
+)
 from .selection import (
     Selection,
     SelectionSettings,
@@ -35,8 +44,6 @@ from .visibility import Sight
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
 
 
 @dataclass(frozen=True)
@@ -96,72 +103,6 @@ class Masks:
         return int(sum(v.target.sum() for v in self.views))
 
 
-def box_polygon(
-    box: Box,
-    camera: Camera,
-    near: float,  # z below which the box is cut away, scene units
-) -> np.ndarray | None:
-    """The convex outline of a box in a view, [M, 2] pixels, clipped against the near plane before projecting.
-
-    None if nothing of the box lies in front of the camera.
-    """
-    points = camera.to_camera(box.corners())
-    in_front = points[:, 2] >= near
-    visible = [points[in_front]]
-    for a, b in EDGES:
-        if in_front[a] != in_front[b]:
-            s = (near - points[a, 2]) / (points[b, 2] - points[a, 2])
-            visible.append((points[a] + s * (points[b] - points[a]))[None])
-    cut = np.concatenate(visible)
-    if len(cut) < 3:
-        return None
-    uv = cut[:, :2] / cut[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    hull = cv2.convexHull(uv.astype(np.float32))[:, 0]
-    return hull if len(hull) >= 3 else None
-
-
-def fill_polygon(
-    polygon: np.ndarray,  # [M, 2] convex, pixels
-    width: int,
-    height: int,
-) -> np.ndarray:
-    """[H, W] bool: pixels whose centre lies inside a convex polygon of either orientation."""
-    mask = np.zeros((height, width), dtype=bool)
-    low = np.clip(np.floor(polygon.min(0)), 0, [width, height]).astype(int)
-    high = np.clip(np.ceil(polygon.max(0)), 0, [width, height]).astype(int)
-    if (high <= low).any():
-        return mask
-    x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
-    start, end = polygon.astype(np.float64), np.roll(polygon.astype(np.float64), -1, axis=0)
-    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(start, end)]
-    inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
-    mask[low[1] : high[1], low[0] : high[0]] = inside
-    return mask
-
-
-def guard_gaussians(
-    gaussians: Gaussians,
-    candidates: np.ndarray,  # [N] bool, the kept ones
-    polygon: np.ndarray,  # [M, 2]
-    camera: Camera,
-    scale: float,
-) -> np.ndarray:
-    """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
-    uv, _ = camera.project(gaussians.means.astype(np.float64))
-    centre = polygon.mean(0)
-
-    def inside(outline: np.ndarray) -> np.ndarray:
-        rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
-        start, end = outline, np.roll(outline, -1, axis=0)
-        u, v = uv[rows, 0, None], uv[rows, 1, None]
-        side = (end - start)[:, 0] * (v - start[:, 1]) - (end - start)[:, 1] * (u - start[:, 0])
-        result = np.zeros(len(uv), dtype=bool)
-        result[rows] = (side >= 0).all(1) | (side <= 0).all(1)
-        return result
-
-    return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
-
-
 def find_masks(
     gaussians: Gaussians,
     region: Region,
@@ -204,13 +145,15 @@ def find_masks(
     selection, weights = by_centre(inside), None
     if not settings.selection.by_centre:
         selection, weights = _choose(gaussians, region, before, passes, settings.selection)
-    after, needed = _empty(gaussians, selection, before, passes, settings)
+    gone = passes.over(lambda b: _weight_of(gaussians, selection.removed, b.camera, settings), before)
+    sight = Sight.make([(b.camera, b.depth, _untrusted(w, b.extra, settings)) for b, w in zip(before, gone)])
+    after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
     if weights is not None and settings.selection.support > 0:
         unseen = _weight_on(gaussians, selection, before, needed, passes)
         revised = without_revealed(gaussians, selection, region, weights.clear, unseen, settings.selection)
         if revised.removed.sum() > selection.removed.sum():
             selection = revised
-            after, needed = _empty(gaussians, selection, before, passes, settings)
+            after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
     if settings.mode == "paper":
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
     views = tuple(_view_masks(b, a, n, settings) for b, a, n in zip(before, after, needed))
@@ -280,8 +223,8 @@ def _look(
     depth, alpha = surface_depth(gaussians, camera)
     agrees = np.ones(size, bool)
     if photo is not None and not settings.selection.by_centre:
-        window = _window(np.concatenate(polygons), camera, settings.around)
-        drawn = render(gaussians, _cropped(camera, window), passes=frozenset({"rgb"})).rgb
+        window = window_round(np.concatenate(polygons), camera, settings.around)
+        drawn = render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb
         misfit = np.abs(np.clip(drawn, 0, 1) - photo[window] / np.float32(255)).max(-1)
         limit = max(settings.selection.least_misfit, settings.selection.misfit * float(np.median(misfit)))
         agrees[window] = misfit <= limit
@@ -306,43 +249,52 @@ def _choose(
     return select(gaussians, region, weights, surroundings, settings), weights
 
 
+def _weight_of(gaussians: Gaussians, removed: np.ndarray, camera: Camera, settings: MaskSettings) -> np.ndarray:
+    """[H, W]: blend weight of the removed Gaussians, with the object in place."""
+    window = gaussians_window(gaussians.take(removed), camera, settings.around)
+    weight = np.zeros((camera.height, camera.width), np.float32)
+    weight[window] = footprint(gaussians, cropped(camera, window), removed)
+    return weight
+
+
+def _untrusted(gone: np.ndarray, extra: np.ndarray | None, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels that show nothing but the object, or what the user masked."""
+    return gone > settings.hides if extra is None else (gone > settings.hides) | extra
+
+
 def _empty(
     gaussians: Gaussians,
     selection: Selection,
     before: Sequence[_Before],
+    gone: Sequence[np.ndarray],  # [H, W] each, see _weight_of
+    sight: Sight,
     passes: _Passes,
     settings: MaskSettings,
 ) -> tuple[list[_After], list[np.ndarray]]:
-    """Every view without the object, and where it shows what no view saw."""
-    removed = selection.removed
-    kept, gone = gaussians.take(~removed), gaussians.take(removed)
+    """Every view without the object, and where it then shows what no view saw, [H, W] bool each."""
+    kept, removed = gaussians.take(~selection.removed), gaussians.take(selection.removed)
 
-    def without(view: _Before) -> _After:
+    def without(k: int) -> tuple[_After, np.ndarray]:
         """Only the part that the object touched is drawn anew."""
-        window = _window(_extent(gone, view.camera), view.camera, settings.around)
-        part = _cropped(view.camera, window)
-        depth, alpha = view.depth.copy(), view.alpha.copy()
-        depth[window], alpha[window] = surface_depth(kept, part)
-        weight = np.zeros_like(alpha)
-        weight[window] = footprint(gaussians, part, removed)
-        return _After(depth, alpha, weight)
+        camera = before[k].camera
+        window = gaussians_window(removed, camera, settings.around)
+        depth, alpha = before[k].depth.copy(), before[k].alpha.copy()
+        depth[window], alpha[window] = surface_depth(kept, cropped(camera, window))
+        after = _After(depth, alpha, gone[k])
+        return after, _needed(camera, after, sight, settings)
 
-    after = passes.over(without, before)
-    hidden = [a.weight > settings.hides for a in after]
-    hidden = [h if b.extra is None else h | b.extra for h, b in zip(hidden, before)]
-    sight = Sight.make([(b.camera, b.depth, h) for b, h in zip(before, hidden)])
-    return after, parallel_map(lambda k: _needed(before[k].camera, after[k], sight, settings), range(len(after)))
+    found = passes.over(without, range(len(before)))
+    return [a for a, _ in found], [n for _, n in found]
 
 
 def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1)."""
     touched = after.weight > settings.changed
-    solid = touched & (after.alpha >= settings.solid) & (after.depth > 0)
-    rows, cols = np.nonzero(solid)
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), after.depth[rows, cols].astype(np.float64))
+    solid = touched & (after.alpha >= settings.solid)
+    window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
+    rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
     evidence = touched & (after.alpha < settings.void)
     evidence[rows, cols] = sight.shows(points, settings.depth_tolerance)
-    window = _window(np.argwhere(touched)[:, ::-1], camera, settings.around)
     evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
     return touched & ~evidence
 
@@ -385,46 +337,6 @@ def _view_masks(before: _Before, after: _After, needed: np.ndarray, settings: Ma
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(
         before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, after.depth, after.alpha
-    )
-
-
-def _extent(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[2, 2] pixels: corners of a rectangle round all that the Gaussians can touch; the picture's where they reach
-    behind the camera."""
-    usable = gaussians.usable
-    x = camera.to_camera(gaussians.means[usable].astype(np.float64))
-    reach = 3.5 * gaussians.scales[usable].max(1)[:, None]
-    x, reach = x[x[:, 2] + reach[:, 0] > 0], reach[x[:, 2] + reach[:, 0] > 0]
-    near, far = x[:, 2:] - reach, x[:, 2:] + reach
-    if len(x) == 0 or (near <= 0).any():
-        return np.array([[0.0, 0.0], [camera.width, camera.height]])
-    low = np.minimum((x[:, :2] - reach) / near, (x[:, :2] - reach) / far).min(0)
-    high = np.maximum((x[:, :2] + reach) / near, (x[:, :2] + reach) / far).max(0)
-    return np.stack([low, high]) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-
-
-def _window(
-    points: np.ndarray,  # [N, 2] pixels
-    camera: Camera,
-    margin: int,
-) -> tuple[slice, slice]:
-    """Rows and columns of the rectangle round the points and a margin, within the picture; never empty."""
-    size = np.array([camera.width, camera.height])
-    ends = [points.min(0), points.max(0)] if len(points) else [size / 2, size / 2]
-    low = np.clip(np.floor(ends[0]) - margin, 0, size - 1).astype(int)
-    high = np.clip(np.ceil(ends[1]) + margin, low + 1, size).astype(int)
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
-def _cropped(camera: Camera, window: tuple[slice, slice]) -> Camera:
-    """The part of a view in a window, with exact intrinsics."""
-    rows, cols = window
-    return replace(
-        camera,
-        width=cols.stop - cols.start,
-        height=rows.stop - rows.start,
-        cx=camera.cx - cols.start,
-        cy=camera.cy - rows.start,
     )
 
 

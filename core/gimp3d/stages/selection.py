@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..gaussians import Gaussians, quats_to_matrices
 from ..raster import contributions
 from ..threads import parallel_map
+from .outline import box_window, surface_points
 from .surroundings import Surroundings, SurroundingsSettings
 
 PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
@@ -120,13 +121,13 @@ def object_and_rim(
 
     Both [H, W] bool. In the ring the colours of splats that stand where the object meets the floor run together.
     """
-    rows, cols = np.nonzero(depth > 0)
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
-    inside = np.flatnonzero(in_region(region, points))
-    for part in surroundings:
-        inside = inside[part.distance(points[inside]) > settings.surroundings.thickness * part.cell]
     found = np.zeros(depth.shape, np.uint8)
-    found[rows[inside], cols[inside]] = 1
+    for box in region:
+        rows, cols, points = surface_points(camera, depth, box_window(box, camera))
+        inside = np.flatnonzero(box.contains(points))
+        for part in surroundings:
+            inside = inside[part.distance(points[inside]) > settings.surroundings.thickness * part.cell]
+        found[rows[inside], cols[inside]] = 1
     found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     if not found.any():
         return found > 0, found > 0

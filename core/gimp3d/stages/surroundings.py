@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.ndimage
@@ -18,6 +18,7 @@ from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..jit import exact_kernel
 from ..threads import parallel_map
+from .outline import box_window, surface_points
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix
 
@@ -104,8 +105,7 @@ def follow_surroundings(
 
 def _points_in(box: Box, half: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
     """The depth map's points in the grid, [N, 3] in the box's axes."""
-    rows, cols = np.nonzero(depth > 0)
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
+    _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera))
     local = (points - box.center) @ box.axes
     return local[(np.abs(local) < half).all(1)]
 
