@@ -146,14 +146,13 @@ def find_masks(
     if not settings.selection.by_centre:
         selection, weights = _choose(gaussians, region, before, passes, settings.selection)
     gone = passes.over(lambda b: _weight_of(gaussians, selection.removed, b.camera, settings), before)
-    sight = Sight.make([(b.camera, b.depth, _untrusted(w, b.extra, settings)) for b, w in zip(before, gone)])
-    after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
+    hidden = [weight > settings.hides for weight in gone]
     if weights is not None and settings.selection.support > 0:
-        unseen = _weight_on(gaussians, selection, before, needed, passes)
-        revised = without_revealed(gaussians, selection, region, weights.clear, unseen, settings.selection)
-        if revised.removed.sum() > selection.removed.sum():
-            selection = revised
-            after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
+        revealed = _weight_on(gaussians, selection, before, hidden, passes)
+        selection = without_revealed(gaussians, selection, region, weights.clear, revealed, settings.selection)
+    untrusted = [h | ~b.agrees if b.extra is None else h | ~b.agrees | b.extra for b, h in zip(before, hidden)]
+    sight = Sight.make([(b.camera, b.depth, u) for b, u in zip(before, untrusted)])
+    after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
     if settings.mode == "paper":
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
     views = tuple(_view_masks(b, a, n, settings) for b, a, n in zip(before, after, needed))
@@ -257,11 +256,6 @@ def _weight_of(gaussians: Gaussians, removed: np.ndarray, camera: Camera, settin
     return weight
 
 
-def _untrusted(gone: np.ndarray, extra: np.ndarray | None, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: pixels that show nothing but the object, or what the user masked."""
-    return gone > settings.hides if extra is None else (gone > settings.hides) | extra
-
-
 def _empty(
     gaussians: Gaussians,
     selection: Selection,
@@ -303,15 +297,16 @@ def _weight_on(
     gaussians: Gaussians,
     selection: Selection,
     before: Sequence[_Before],
-    needed: Sequence[np.ndarray],
+    pixels: Sequence[np.ndarray],  # [H, W] bool each
     passes: _Passes,
 ) -> np.ndarray:
-    """[N]: blend weight of the kept Gaussians on the needed pixels of all views, without the object."""
+    """[N]: blend weight of the kept Gaussians on those pixels of all views, without the object."""
     stays = ~selection.removed
     kept = gaussians.take(stays)
-    core = [cv2.erode(n.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 for n in needed]
     total = np.zeros(len(gaussians))
-    for part in passes.over(lambda k: contributions(kept, before[k].camera, pixels=core[k]).total, range(len(core))):
+    for part in passes.over(
+        lambda k: contributions(kept, before[k].camera, pixels=pixels[k]).total, range(len(pixels))
+    ):
         total[stays] += part
     return total
 

@@ -43,7 +43,7 @@ class SelectionSettings:
     mostly: float = 0.5  # share of its mass, or of its weight, that decides
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
     shown: float = 0.5  # weight below which a Gaussian shows nothing
-    support: float = 0.1  # of a Gaussian's weight on what no view saw, views must have shown so much; 0 keeps all
+    support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
     near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
     least_misfit: float = 0.1  # … and by so much, colours in [0, 1]
@@ -195,7 +195,7 @@ def without_revealed(
     selection: Selection,
     region: Region,
     clear: np.ndarray,  # [N] weight on what views showed unhidden, with the object in place
-    unseen: np.ndarray,  # [N] weight of the kept ones on what no view saw, without the object
+    revealed: np.ndarray,  # [N] weight of the kept ones where the object was, without it
     settings: SelectionSettings = SelectionSettings(),
 ) -> Selection:
     """Remove what the removal reveals near the region and no photo vouches for (METHOD section 1, contamination).
@@ -206,7 +206,7 @@ def without_revealed(
     for box in region:
         local = (gaussians.means - box.center) @ box.axes
         near |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
-    found = near & ~selection.removed & (unseen > settings.shown) & (clear < settings.support * unseen)
+    found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
     return Selection(np.where(found, np.uint8(Fate.REVEALED), selection.fates))
 
 
