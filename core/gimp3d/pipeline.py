@@ -41,6 +41,7 @@ from .stages.reference import (
     rim,
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
 R = TypeVar("R")
@@ -70,7 +71,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "balanced": RemovalSettings(),
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
-        masks=MaskSettings(mode="paper", support=0.0),
+        masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         propagate=PropagateSettings(transfer="sample"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
@@ -184,9 +185,9 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
-    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress))
-    keep = ~masks.removed
     photos = {v.camera.id: v.image for v in views}
+    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress, photos))
+    keep = ~masks.removed
     for v in _spread(masks.views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if not masks.removed.any():
@@ -432,6 +433,7 @@ STORED = (
     Camera,
     Gaussians,
     Masks,
+    Selection,
     ViewMasks,
     ReferenceChoice,
     ViewScore,
