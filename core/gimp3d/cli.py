@@ -77,7 +77,9 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="PROVIDER",
         help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD",
     )
-    remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH")
+    remove.add_argument(
+        "--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH|onnx:PATH"
+    )
     remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
     remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
     remove.add_argument("--views-out", metavar="DIR", help="write every completed view")

@@ -95,10 +95,12 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | depth | appearance | mapping | rules
+    kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    data: tuple[np.ndarray, ...]  # per kind: (target) | (depth, target) | (target) | (rows, cols) | (rules)
+    data: tuple[
+        np.ndarray, ...
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
 
 
 @dataclass(frozen=True)
@@ -303,6 +305,7 @@ def _fill_from_one_view(
     name = view.camera.id
     run.pictures += [
         Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
+        *_fit_picture(completed, appearance.image, name),
         Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
         Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
         *(Picture("rules", f"Filled view {p.camera_id}", p.image, (p.rules,)) for p in _spread(painting.views)),
@@ -342,6 +345,14 @@ def _complete_depth(
     return complete_depth(
         view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)
     )
+
+
+def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
+    """How the depth prior was scaled, if there was one."""
+    if len(completed.gradients) == 0:
+        return []
+    data = (completed.gradients, np.array([completed.scale_factor]))
+    return [Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data)]
 
 
 def _appearance(
