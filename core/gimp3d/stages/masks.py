@@ -19,6 +19,7 @@ from ..progress import Progress, silent
 from ..raster import contributions, footprint, render, surface_depth
 from ..threads import parallel_map
 from .outline import (
+    Window,
     box_polygon,
     cropped,
     fill_polygon,
@@ -40,7 +41,7 @@ from .selection import (
     without_revealed,
 )
 from .surroundings import follow_surroundings
-from .visibility import Sight
+from .visibility import Sight, depth_agreement
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,6 +65,8 @@ class MaskSettings:
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
+    least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
+    least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
     selection: SelectionSettings = SelectionSettings()
 
 
@@ -153,13 +156,34 @@ def find_masks(
     untrusted = [h | ~b.agrees if b.extra is None else h | ~b.agrees | b.extra for b, h in zip(before, hidden)]
     sight = Sight.make([(b.camera, b.depth, u) for b, u in zip(before, untrusted)])
     after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
-    if settings.mode == "paper":
+    mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
+    if warnings or mode == "paper":
+        mode = "paper"
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
-    views = tuple(_view_masks(b, a, n, settings) for b, a, n in zip(before, after, needed))
+    views = tuple(_view_masks(b, a, n, mode, settings) for b, a, n in zip(before, after, needed))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
-    return Masks(selection, views, left_out, settings.mode, len(views) / len(cameras), reason)
+    reason = "; ".join([*warnings, reason])
+    return Masks(selection, views, left_out, mode, len(views) / len(cameras), reason, warnings)
+
+
+def _inconsistencies(before: Sequence[_Before], settings: MaskSettings) -> tuple[str, ...]:
+    """Why what one view shows says nothing about the others, in words."""
+    instead = "every pixel of the box's outline is filled (mode paper)"
+    cameras = [b.camera for b in before]
+    agreement = depth_agreement(
+        cameras, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance
+    )
+    likeness = [b.likeness for b in before if np.isfinite(b.likeness)]
+    found = []
+    if agreement < settings.least_agreement:
+        found.append(f"views place only {agreement:.0%} of the surface alike: {instead}")
+    if likeness and np.median(likeness) < settings.least_likeness:
+        found.append(
+            f"photos and scene do not match (correlation {np.median(likeness):.2f}), check the poses: {instead}"
+        )
+    return tuple(found)
 
 
 def _polygons(region: Region, camera: Camera, settings: MaskSettings) -> list[np.ndarray]:
@@ -189,9 +213,11 @@ class _Before:
 
     camera: Camera
     polygons: list[np.ndarray]
+    window: Window  # of the region and a margin
     depth: np.ndarray
     alpha: np.ndarray
     agrees: np.ndarray  # bool, the photo shows what the scene shows, as far as it was looked at
+    likeness: float  # correlation of photo and scene in the window; NaN if it cannot be told
     extra: np.ndarray | None  # bool, the extra mask
 
 
@@ -220,19 +246,27 @@ def _look(
                 f"masks: the {kind} of {camera.id} is {picture.shape[1]}×{picture.shape[0]}, not {size[1]}×{size[0]}"
             )
     depth, alpha = surface_depth(gaussians, camera)
-    agrees = np.ones(size, bool)
-    if photo is not None and not settings.selection.by_centre:
-        window = window_round(np.concatenate(polygons), camera, settings.around)
-        drawn = render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb
-        misfit = np.abs(np.clip(drawn, 0, 1) - photo[window] / np.float32(255)).max(-1)
+    window = window_round(np.concatenate(polygons), camera, settings.around)
+    agrees, likeness = np.ones(size, bool), np.nan
+    if photo is not None:
+        drawn = np.clip(render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb, 0, 1)
+        shown = photo[window] / np.float32(255)
+        misfit = np.abs(drawn - shown).max(-1)
         limit = max(settings.selection.least_misfit, settings.selection.misfit * float(np.median(misfit)))
-        agrees[window] = misfit <= limit
-    return _Before(camera, polygons, depth, alpha, agrees, mask)
+        agrees[window], likeness = misfit <= limit, _correlation(drawn.mean(-1), shown.mean(-1))
+    return _Before(camera, polygons, window, depth, alpha, agrees, likeness, mask)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's; NaN where either is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    spread = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / spread if spread > 1e-6 * a.size else np.nan
 
 
 def _choose(
     gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
-) -> tuple[Selection, Weights]:
+) -> tuple[Selection, Weights | None]:
     """Which Gaussians go, by what the views show of them."""
     depths = [(b.camera, b.depth) for b in before]
     surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
@@ -244,7 +278,10 @@ def _choose(
             object_, clear = object_ & ~view.extra, clear & ~view.extra
         return Sighting(view.camera, object_, clear, view.extra)
 
-    weights = weigh(gaussians, passes.over(sighting, before))
+    sightings = passes.over(sighting, before)
+    if not any(s.object_.sum() > settings.least_object * _polygon_pixels(b).sum() for s, b in zip(sightings, before)):
+        return by_centre(select_removed(gaussians, region)), None  # nothing stands out: the surface itself is meant
+    weights = weigh(gaussians, sightings)
     return select(gaussians, region, weights, surroundings, settings), weights
 
 
@@ -323,10 +360,10 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
     return np.any([fill_polygon(p, view.camera.width, view.camera.height) for p in view.polygons], axis=0)
 
 
-def _view_masks(before: _Before, after: _After, needed: np.ndarray, settings: MaskSettings) -> ViewMasks:
+def _view_masks(before: _Before, after: _After, needed: np.ndarray, mode: str, settings: MaskSettings) -> ViewMasks:
     silhouette = after.weight > settings.changed
     occluder = _in_front(before.depth, after.weight > 0.5, settings)
-    target = needed if settings.mode == "paper" else _tidy(needed, silhouette, settings.margin)
+    target = needed if mode == "paper" else _tidy(needed, silhouette, settings.margin)
     target, depth = target & ~occluder, before.depth
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)

@@ -44,6 +44,7 @@ class SelectionSettings:
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
     shown: float = 0.5  # weight below which a Gaussian shows nothing
     support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
+    least_object: float = 0.002  # share of the region's outline that the object fills in some view, else all goes
     near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
     least_misfit: float = 0.1  # … and by so much, colours in [0, 1]

@@ -12,7 +12,8 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel
-from ..threads import run_ranges
+from ..threads import parallel_map, run_ranges
+from .outline import Window, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
 
@@ -47,6 +48,40 @@ class Sight:
         arrays = np.ascontiguousarray(points, np.float64), self.cameras, self.starts, self.limits
         run_ranges(_find_view, len(points), *arrays, float(tolerance), found)
         return found
+
+
+def depth_agreement(
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
+    windows: Sequence[Window],  # the parts to look at
+    tolerance: float,  # relative z
+    samples: int = 1000,  # per view
+) -> float:
+    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.
+
+    1 where nothing can be compared.
+    """
+    centres = np.array([c.centre for c in cameras])
+    forwards = np.array([c.forward for c in cameras])
+    spread = max(1e-12, float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1))))
+
+    def compared(k: int) -> np.ndarray:
+        apart = np.linalg.norm(centres - centres[k], axis=1) / spread + 1 - forwards @ forwards[k]
+        apart[k] = np.inf
+        other = int(apart.argmin())
+        _, _, points = surface_points(cameras[k], depths[k], windows[k])
+        uv, z = cameras[other].project(points[:: max(1, len(points) // samples)])
+        height, width = depths[other].shape
+        framed = (z > 0) & (uv >= 0).all(1) & (uv < [width, height]).all(1)
+        cols, rows = uv[framed].astype(int).T
+        there, z = depths[other][rows, cols], z[framed]
+        through = (there > z * (1 + tolerance)) | (there == 0)
+        return np.array([(np.abs(there - z) <= tolerance * z).sum(), through.sum()])
+
+    if len(cameras) < 2:
+        return 1.0
+    same, through = np.sum(parallel_map(compared, range(len(cameras))), axis=0)
+    return float(same / (same + through)) if same + through else 1.0
 
 
 def _spread_order(count: int) -> list[int]:
