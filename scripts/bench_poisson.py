@@ -359,7 +359,7 @@ def memory_of(size: str, solver: str) -> float | None:
     if not reset.exists():
         return None
     given = problem(Case(size))
-    SOLVERS[solver](problem(Case("480p")), 1e-6)
+    SOLVERS[solver](problem(Case("480p", share=0.01)), 1e-6)
 
     def kib(name: str) -> int:
         return next(int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith(name))
