@@ -99,7 +99,7 @@ def _scale_case(kind: str, error: float, seed: int) -> Row:
         settings = replace(OURS, surface="smooth", scale_factor=scale)
         return rmse(complete_disparity(scene.measured, ~hole, hole, with_prior, settings).disparity[hole])
 
-    tried = np.linspace(0, 2, 17)[1:] * (0 if flat else gain)
+    tried = np.linspace(0.2, 1.4, 7) * (0 if flat else gain)
     return {
         "kind": kind,
         "error": error,
