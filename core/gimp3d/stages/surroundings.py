@@ -56,9 +56,10 @@ class Surroundings:
         points: np.ndarray,  # [N, 3] scene coordinates
     ) -> np.ndarray:
         """[N]: how far points lie off the surface's plane nearby, in scene units; infinite where there is none."""
-        local = (points - self.box.center) @ self.box.axes
-        index = np.floor((local + self.half) / self.cell)
-        inside = ((index >= 0) & (index < self.nearest.shape)).all(1)
+        with np.errstate(invalid="ignore"):
+            local = (points - self.box.center) @ self.box.axes
+            index = np.floor((local + self.half) / self.cell)
+            inside = ((index >= 0) & (index < self.nearest.shape)).all(1)
         rows = np.full(len(points), -1, np.int32)
         rows[inside] = self.nearest[tuple(index[inside].astype(int).T)]
         found = rows >= 0
