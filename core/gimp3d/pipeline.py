@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
@@ -116,6 +116,7 @@ class RemovalResult:
     pictures: tuple[Picture, ...] = ()
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
+    selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
 
 
 class Store(Protocol):
@@ -167,6 +168,7 @@ def remove_object(
     reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
     progress: Progress = silent,
     store: Store | None = None,
+    extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
 
@@ -188,7 +190,9 @@ def remove_object(
     """
     run = _Run(store, progress)
     photos = {v.camera.id: v.image for v in views}
-    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress, photos))
+    cameras = [v.camera for v in views]
+    masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
+    run.warnings += masks.warnings
     keep = ~masks.removed
     for v in _spread(masks.views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
@@ -436,6 +440,7 @@ def _finish(
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
+        selection=masks.selection.counts,
     )
 
 

@@ -190,7 +190,10 @@ def _page(
     )
     warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
     settings = text(json.dumps(summary["settings"], indent=1))
-    numbers = "".join(f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>" for k, v in counts.items())
+    numbers = "".join(
+        f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>"
+        for k, v in (counts | summary.get("selection", {})).items()
+    )
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
         f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"

@@ -248,7 +248,7 @@ def _look(
     depth, alpha = surface_depth(gaussians, camera)
     window = window_round(np.concatenate(polygons), camera, settings.around)
     agrees, likeness = np.ones(size, bool), np.nan
-    if photo is not None:
+    if photo is not None and not settings.selection.by_centre:
         drawn = np.clip(render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb, 0, 1)
         shown = photo[window] / np.float32(255)
         misfit = np.abs(drawn - shown).max(-1)

@@ -133,8 +133,9 @@ def surface_points(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z, 0 = nothing
     window: Window,
+    step: int = 1,  # only every step-th row and column
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows [N], columns [N] and scene points [N, 3] of the pixels in a window that show a surface."""
-    rows, cols = np.nonzero(depth[window] > 0)
-    rows, cols = rows + window[0].start, cols + window[1].start
+    rows, cols = np.nonzero(depth[window][::step, ::step] > 0)
+    rows, cols = step * rows + window[0].start, step * cols + window[1].start
     return rows, cols, camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))

@@ -22,16 +22,16 @@ PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
 
 
 class Fate(IntEnum):
-    """What becomes of a Gaussian and why; from CENTRE on it goes."""
+    """What becomes of a Gaussian and why; from REMOVED_INSIDE on it goes."""
 
     OUTSIDE = 0  # stays: does not reach the region, or cannot be drawn
-    STRADDLING = 1  # stays: reaches in, but shows elsewhere
-    LARGE = 2  # stays: its centre lies inside, but most of it outside, and it shows elsewhere
-    SURFACE = 3  # stays: inside, but seen unhidden on surface that runs on from outside
-    CENTRE = 4  # goes: inside
-    STRADDLER = 5  # goes: reaches in and shows on the object
-    REVEALED = 6  # goes: near, and only the removal would show it
-    MASKED = 7  # goes: shows under the extra masks
+    KEPT_STRADDLING = 1  # stays: reaches in, but shows elsewhere
+    KEPT_LARGE = 2  # stays: its centre lies inside, but it is as large as the region and shows elsewhere
+    KEPT_SURFACE = 3  # stays: inside, but seen unhidden on surface that runs on from outside
+    REMOVED_INSIDE = 4  # goes: inside
+    REMOVED_STRADDLING = 5  # goes: reaches in and shows on the object
+    REMOVED_REVEALED = 6  # goes: near, and only the removal would show it
+    REMOVED_MASKED = 7  # goes: shows under the extra masks
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class SelectionSettings:
     straddle: float = 0.02  # share of a Gaussian's mass in the region from which it reaches in
     mostly: float = 0.5  # share of its mass, or of its weight, that decides
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
+    large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
     shown: float = 0.5  # weight below which a Gaussian shows nothing
     support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
     least_object: float = 0.002  # share of the region's outline that the object fills in some view, else all goes
@@ -60,23 +61,31 @@ class Selection:
     @property
     def removed(self) -> np.ndarray:
         """[N] bool."""
-        return self.fates >= Fate.CENTRE
+        return self.fates >= Fate.REMOVED_INSIDE
 
     @property
     def counts(self) -> dict[str, int]:
-        return {f.name.lower(): int((self.fates == f).sum()) for f in Fate if f != Fate.OUTSIDE}
+        return {f.name.lower(): self.count(f) for f in Fate if f != Fate.OUTSIDE}
+
+    def count(self, fate: Fate) -> int:
+        return int((self.fates == fate).sum())
 
     @property
     def words(self) -> str:
         """What went and what stayed, for people."""
-        c = self.counts
-        gone = f"{self.removed.sum()} Gaussians go ({c['centre']} inside, {c['straddler']} straddlers"
-        gone += f", {c['revealed']} that only the removal would show" if c["revealed"] else ""
-        gone += f", {c['masked']} under extra masks" if c["masked"] else ""
-        stay = [f"{c['surface']} of floor or wall"] if c["surface"] else []
-        stay += [f"{c['large']} large"] if c["large"] else []
-        stay += [f"{c['straddling']} straddling"] if c["straddling"] else []
-        return f"{gone}); {', '.join(stay) or 'nothing'} in the region stays"
+        gone = [
+            f"{self.count(Fate.REMOVED_INSIDE)} inside",
+            f"{self.count(Fate.REMOVED_STRADDLING)} straddlers",
+            f"{self.count(Fate.REMOVED_REVEALED)} that only the removal would show",
+            f"{self.count(Fate.REMOVED_MASKED)} under extra masks",
+        ]
+        stay = [
+            f"{self.count(Fate.KEPT_SURFACE)} of floor or wall",
+            f"{self.count(Fate.KEPT_STRADDLING)} straddlers",
+            f"{self.count(Fate.KEPT_LARGE)} large ones",
+        ]
+        parts = [", ".join(p for p in part if not p.startswith("0 ")) or "none" for part in (gone, stay)]
+        return f"{int(self.removed.sum())} Gaussians go ({parts[0]}), in the region stay {parts[1]}"
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,7 @@ def by_centre(
     inside: np.ndarray,  # [N] bool, see select_removed
 ) -> Selection:
     """The paper's rule."""
-    return Selection(np.where(inside, Fate.CENTRE, Fate.OUTSIDE).astype(np.uint8))
+    return Selection(np.where(inside, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
 
 
 def object_and_rim(
@@ -177,17 +186,19 @@ def select(
     mass[rows] = mass_inside(gaussians, rows, region)
     fates = np.zeros(len(gaussians), np.uint8)
     straddling = ~centre & (mass >= settings.straddle)
-    fates[straddling] = Fate.STRADDLING
-    fates[straddling & visible & (on_object > settings.mostly)] = Fate.STRADDLER
-    fates[centre] = Fate.CENTRE
-    fates[centre & (mass < settings.mostly) & visible & (on_object <= settings.mostly)] = Fate.LARGE
-    inside = np.flatnonzero(fates == Fate.CENTRE)
+    fates[straddling] = Fate.KEPT_STRADDLING
+    fates[straddling & visible & (on_object > settings.mostly)] = Fate.REMOVED_STRADDLING
+    fates[centre] = Fate.REMOVED_INSIDE
+    elsewhere = centre & (mass < settings.mostly) & visible & (on_object <= settings.mostly)
+    large = gaussians.scales.max(1) > settings.large * min(box.size.min() for box in region)
+    fates[elsewhere] = np.where(large[elsewhere], Fate.KEPT_LARGE, Fate.KEPT_STRADDLING)
+    inside = np.flatnonzero(fates == Fate.REMOVED_INSIDE)
     clean = visible[inside] & (on_object[inside] <= settings.mostly)
     for part in surroundings:
         surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
-        fates[inside[surface & clean]] = Fate.SURFACE
+        fates[inside[surface & clean]] = Fate.KEPT_SURFACE
     under_masks = weights.masked > np.maximum(settings.shown, settings.mostly * (weights.masked + weights.unmasked))
-    fates[under_masks & gaussians.usable & (fates < Fate.CENTRE)] = Fate.MASKED
+    fates[under_masks & gaussians.usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
 
 
@@ -208,7 +219,7 @@ def without_revealed(
         local = (gaussians.means - box.center) @ box.axes
         near |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
     found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
-    return Selection(np.where(found, np.uint8(Fate.REVEALED), selection.fates))
+    return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
 
 
 def mass_inside(

@@ -20,6 +20,7 @@ from ..jit import exact_kernel
 from ..threads import parallel_map
 from .outline import box_window, surface_points
 
+SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix
 
 
@@ -27,10 +28,11 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 
 class SurroundingsSettings:
     """How surface is followed into a box. Lengths in cells unless said otherwise."""
 
-    cells: int = 800_000  # of the grid round one box: its resolution
+    cells: int = 800_000  # of the grid round one box at most
+    least_cell: float = 1.5  # edge of a cell, pixels of a usual view
+    least_points: int = 3  # in a cell that counts as surface
     beyond: float = 0.25  # how far the grid reaches beyond the box, as a share of its longest edge
     views: int = 60  # at most so many, spread evenly, are gathered
-    least_points: int = 3  # in a cell that counts as surface
     step: float = 0.6  # how far a cell may lie off the plane of those reached before it
     turn: float = 50.0  # degrees that its normal may differ from theirs
     adapt: float = 0.25
@@ -54,9 +56,10 @@ class Surroundings:
         points: np.ndarray,  # [N, 3] scene coordinates
     ) -> np.ndarray:
         """[N]: how far points lie off the surface's plane nearby, in scene units; infinite where there is none."""
-        local = (points - self.box.center) @ self.box.axes
-        index = np.floor((local + self.half) / self.cell)
-        inside = ((index >= 0) & (index < self.nearest.shape)).all(1)
+        with np.errstate(invalid="ignore"):
+            local = (points - self.box.center) @ self.box.axes
+            index = np.floor((local + self.half) / self.cell)
+            inside = ((index >= 0) & (index < self.nearest.shape)).all(1)
         rows = np.full(len(points), -1, np.int32)
         rows[inside] = self.nearest[tuple(index[inside].astype(int).T)]
         found = rows >= 0
@@ -73,14 +76,17 @@ def follow_surroundings(
 ) -> Surroundings:
     """Follow the surface round a box into it."""
     half = box.size / 2 + settings.beyond * box.size.max()
-    cell = float((8 * half.prod() / settings.cells) ** (1 / 3))
+    pixel = float(np.median([abs(c.to_camera(box.center)[2]) / c.fx for c, _ in views]))
+    points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
+    least = pixel * max(settings.least_cell, math.sqrt(settings.least_points / points_per_cell))
+    cell = max(least, float((8 * half.prod() / settings.cells) ** (1 / 3)))
     dims = tuple(int(n) for n in np.ceil(2 * half / cell))
     used = (
         [views[k * len(views) // settings.views] for k in range(settings.views)]
         if len(views) > settings.views
         else views
     )
-    found = parallel_map(lambda v: _points_in(box, half, *v), used)
+    found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
     local = np.concatenate(found)
     keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T), dims)
     x = local.T
@@ -103,9 +109,11 @@ def follow_surroundings(
     return Surroundings(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
 
 
-def _points_in(box: Box, half: np.ndarray, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """The depth map's points in the grid, [N, 3] in the box's axes."""
-    _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera))
+def _points_in(box: Box, half: np.ndarray, cell: float, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """The depth map's points in the grid, [N, 3] in the box's axes; of large pictures no more than two per cell."""
+    distance = max(float(camera.to_camera(box.center)[2]), 1e-9)
+    step = max(1, int(0.5 * cell * camera.fx / distance))
+    _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera), step)
     local = (points - box.center) @ box.axes
     return local[(np.abs(local) < half).all(1)]
 
