@@ -24,10 +24,10 @@ from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
 from .orbit import orbit_cameras
-from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, remove_object, render_bytes
+from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .report import write_removal_report
+from .report import draw, write_removal_report
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -133,10 +133,16 @@ def write_masks(
     split: str = "train",
     frames: Sequence[str] | None = None,
     extra_masks: Path | None = None,
+    pictures: Path | None = None,
+    depth_prior: str = "auto",
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
-    """Write every view's target region as a 0/255 picture (CONTRACT: masks)."""
+    """Write every view's target region as a 0/255 picture (CONTRACT: masks).
+
+    With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
+    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one.
+    """
     _use_threads(threads)
     gaussians, region = read_scene(scene).gaussians, read_region(roi)
     available = read_cameras(cameras)
@@ -155,11 +161,19 @@ def write_masks(
         photos,
         _read_extra_masks(extra_masks, looked_at),
     )
-    targets = {v.camera.id: v.target for v in found.views}
+    views = {v.camera.id: v for v in found.views}
+    settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
     for camera in written:
+        view = views.get(camera.id)
         empty = np.zeros((camera.height, camera.width), bool)
         target = out / output_name(camera.id)
-        write_png(target.with_name(target.name + ".png"), targets.get(camera.id, empty))
+        write_png(target.with_name(target.name + ".png"), view.target if view else empty)
+        if pictures and view:
+            picture = photos.get(camera.id)
+            shown = render_bytes(gaussians, view.camera) if picture is None else picture
+            target = pictures / output_name(camera.id)
+            for drawn in preview(view, found.views, shown, settings):
+                write_png(target.with_name(f"{target.name}.{drawn.kind}.png"), draw(drawn))
 
 
 def write_orbit(

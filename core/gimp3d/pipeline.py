@@ -351,6 +351,23 @@ def _complete_depth(
     )
 
 
+def preview(
+    view: ViewMasks, views: Sequence[ViewMasks], picture: np.ndarray, settings: RemovalSettings = RemovalSettings()
+) -> tuple[Picture, ...]:
+    """What a removal would do in a view: where it would fill, on what surface, and how a depth prior was scaled."""
+    name = view.camera.id
+    shown = [Picture("mask", f"Region to fill in {name}", picture, (view.target,))]
+    if view.target.any():
+        try:
+            completed = _complete_depth(view, views, picture, settings, None)
+        except IllPosed:
+            return tuple(shown)  # the region is worth seeing all the more
+        depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
+        shown.append(Picture("depth", f"Completed surface in {name}", picture, (depth, view.target)))
+        shown += _fit_picture(completed, picture, name)
+    return tuple(shown)
+
+
 def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
     """How the depth prior was scaled, if there was one."""
     if len(completed.gradients) == 0:

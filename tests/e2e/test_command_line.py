@@ -191,6 +191,9 @@ def test_render_masks_orbit_evaluate_and_info(
         )
         mask = read_image(tmp_path / mode / "orbit" / "000.png")
         assert set(np.unique(mask)) == {0, 255}
+    shown = ["masks", scene_, "--cameras", cams, "--roi", roi, "--out", str(tmp_path / "need"), "--frames", "orbit/000"]
+    assert main([*shown, "--pictures", str(tmp_path / "shown"), *quiet]) == 0
+    assert {p.name for p in (tmp_path / "shown" / "orbit").iterdir()} == {"000.mask.png", "000.depth.png"}
     assert (
         main(
             [
