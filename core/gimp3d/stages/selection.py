@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import cv2
@@ -41,6 +41,7 @@ class SelectionSettings:
     by_centre: bool = False  # the paper's rule: nothing but centres in the region counts
     straddle: float = 0.02  # share of a Gaussian's mass in the region from which it reaches in
     mostly: float = 0.5  # share of its mass, or of its weight, that decides
+    slack: float = 1.0  # how far outside the boxes surface may still be the object's, cells of the surroundings
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
     large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
     shown: float = 0.5  # weight below which a Gaussian shows nothing
@@ -132,9 +133,11 @@ def object_and_rim(
     Both [H, W] bool. In the ring the colours of splats that stand where the object meets the floor run together.
     """
     found = np.zeros(depth.shape, np.uint8)
+    cell = max(part.cell for part in surroundings)
     for box in region:
-        rows, cols, points = surface_points(camera, depth, box_window(box, camera))
-        inside = np.flatnonzero(box.contains(points))
+        grown = replace(box, size=box.size + 2 * settings.slack * cell)
+        rows, cols, points = surface_points(camera, depth, box_window(grown, camera))
+        inside = np.flatnonzero(grown.contains(points))
         for part in surroundings:
             inside = inside[part.distance(points[inside]) > settings.surroundings.thickness * part.cell]
         found[rows[inside], cols[inside]] = 1
@@ -142,7 +145,7 @@ def object_and_rim(
     if not found.any():
         return found > 0, found > 0
     distance = float(np.median(depth[found > 0]))
-    width = max(1, round(camera.fx * settings.rim * max(part.cell for part in surroundings) / distance))
+    width = max(1, round(camera.fx * settings.rim * cell / distance))
     grown = cv2.dilate(found, np.ones((2 * width + 1,) * 2, np.uint8))
     return found > 0, grown > found
 
