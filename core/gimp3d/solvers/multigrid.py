@@ -250,7 +250,7 @@ def _advance(fine, coarse, work, alpha):
 
 @kernel
 def _descend(coarse, work, g, again):
-    """v ← a Jacobi step from zero or w, w ← its residual, restricted to the next grid's b."""
+    """v ← a Jacobi step from zero, or w; w ← its residual, restricted to the next grid's b."""
     b, v, w, steps = work.b, work.v, work.w, coarse.steps
     n, half, quarter = coarse.strides[g], np.float32(0.5), np.float32(0.25)
     for i in range(1, coarse.rows[g] + 1):
@@ -258,10 +258,7 @@ def _descend(coarse, work, g, again):
         if i < coarse.rows[g] - 1:
             for s in range(coarse.first[r], coarse.first[r + 1]):
                 for k in range(coarse.spans[s, 0], coarse.spans[s, 1]):
-                    if again:
-                        v[k] = w[k] + steps[k] * (b[k] - _times(coarse.stencils, w, k, n))
-                    else:
-                        v[k] = steps[k] * b[k]
+                    v[k] = w[k] if again else steps[k] * b[k]
         if 1 < i < coarse.rows[g]:
             for s in range(coarse.first[r - 1], coarse.first[r]):
                 for k in range(coarse.spans[s, 0], coarse.spans[s, 1]):

@@ -149,7 +149,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
 
     # u = the guidance + a constant for each part of the hole + what is solved for
     absent = None
-    if task.guidance is not None and not _take(task.guidance, runs, result):
+    if task.guidance is not None and not _take(task.guidance.reshape(h, -1), runs, channels, result.reshape(-1)):
         absent = ~np.isfinite(result)
         result[absent] = 0
     found = [_known_ties(task, rim, result, absent)]
@@ -185,7 +185,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
         # The right-hand sides add up to zero in each part. So do strengths times the solution, whatever hangs on
         # how few or weak ties.
         error = np.bincount(part, ties.strengths * grids.u.reshape(-1)[places], len(strength)) / strength
-        _add(grids.u, runs, parts, grids.fine.stride, scale, shift[:, c] - scale * error, c, result)
+        _add(grids.u, runs, parts, grids.fine.stride, scale, shift[:, c] - scale * error, result[:, c])
     return HoleSolution(result, most, np.zeros(count, bool))
 
 
@@ -335,23 +335,26 @@ def _root(parent, r):
 
 
 @exact_kernel
-def _take(array, runs, out):
-    """out [M, C] ← the unknowns' pixels of array [h, w, C]; whether all are finite."""
+def _take(rows, runs, channels, out):
+    """out [M · channels] ← the unknowns' values in rows [h, w · channels]; whether all are finite."""
     finite = True
     for r in range(len(runs)):
-        for k in range(runs[r, 2] - runs[r, 1]):
-            for c in range(out.shape[1]):
-                value = array[runs[r, 0] - 1, runs[r, 1] - 1 + k, c]
-                out[runs[r, 3] + k, c] = value
-                finite &= np.isfinite(value)
+        row = rows[runs[r, 0] - 1, (runs[r, 1] - 1) * channels : (runs[r, 2] - 1) * channels]
+        to = out[runs[r, 3] * channels :]
+        for k in range(len(row)):
+            to[k] = row[k]
+            finite &= np.isfinite(row[k])
     return finite
 
 
 @kernel
-def _add(u, runs, parts, stride, scale, shift, c, result):
-    """result [M, C] of channel c += scale · u + the part's shift."""
+def _add(u, runs, parts, stride, scale, shift, out):
+    """out [M] += scale · u + the part's shift."""
     for r in range(len(runs)):
-        i = runs[r, 0]
-        for k in range(runs[r, 2] - runs[r, 1]):
-            j = runs[r, 1] + k
-            result[runs[r, 3] + k, c] += shift[parts[r]] + scale * u[(i + j) & 1, i * stride + j // 2]
+        i, base = runs[r, 0], shift[parts[r]]
+        for first in range(min(2, runs[r, 2] - runs[r, 1])):
+            j = runs[r, 1] + first
+            of_colour = u[(i + j) & 1, i * stride + j // 2 :]
+            to = out[runs[r, 3] + first :]
+            for k in range((runs[r, 2] - j + 1) // 2):
+                to[2 * k] += base + scale * of_colour[k]

@@ -11,7 +11,6 @@ import scipy.sparse
 import scipy.sparse.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from gimp3d.solvers.poisson import PoissonSettings, solve_hole, solve_poisson
 from gimp3d.threads import parallel_map, set_thread_count
@@ -88,13 +87,19 @@ def anchored_parts(hole, known, weight=0.0):
     return np.isin(components, np.setdiff1d(components[scipy.ndimage.binary_dilation(known) | (weight > 0)], [0]))
 
 
-SMALL_MASKS = hnp.arrays(np.int8, st.tuples(st.integers(1, 14), st.integers(1, 14)), elements=st.integers(0, 2))
+def any_mask(height, width, hole, known, seed):
+    """Holes (1), known pixels (2) and neither (0) at random: islands, lines, borders, loose parts."""
+    drawn = np.random.default_rng(seed).random((height, width))
+    return np.where(drawn < hole, 1, np.where(drawn < hole + known * (1 - hole), 2, 0))
+
+
+SHARES = st.sampled_from([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+SMALL_MASKS = st.builds(any_mask, st.integers(1, 14), st.integers(1, 14), SHARES, SHARES, st.integers(0, 10_000))
 
 
 @settings(max_examples=150, deadline=None)
 @given(kinds=SMALL_MASKS, seed=st.integers(0, 99), channels=st.integers(1, 3), single=st.booleans())
 def test_any_mask_solves_as_the_equations_say(kinds, seed, channels, single):
-    """Holes (1), known pixels (2) and neither (0) in any arrangement: islands, lines, borders, loose parts."""
     rng = np.random.default_rng(seed)
     hole, known = kinds == 1, kinds == 2
     values, guidance = rng.standard_normal((2, *kinds.shape, channels))
@@ -169,14 +174,15 @@ def test_the_default_tolerance_is_far_below_a_grey_level_of_the_range():
     assert np.abs(error).max() < 1e-4 * np.ptp(values)
 
 
+@pytest.mark.parametrize(("tolerance", "most"), [(1e-3, 3), (1e-6, 6), (1e-9, 9)])
 @pytest.mark.parametrize("irregular", [False, True])
-def test_iterations_do_not_grow_with_the_hole(irregular):
+def test_iterations_do_not_grow_with_the_hole(irregular, tolerance, most):
     rng, taken = np.random.default_rng(2), []
     for side in (60, 250, 1000):
         hole = blots(rng, (side, side), sigma=side / 20, share=0.3) if irregular else disc(side)
         values = rng.standard_normal(hole.shape)
-        taken.append(solve_hole(hole, ~hole, values, settings=PoissonSettings(1e-6)).iterations)
-    assert min(taken) > 0 and max(taken) <= 7 and max(taken) - min(taken) <= 1
+        taken.append(solve_hole(hole, ~hole, values, settings=PoissonSettings(tolerance)).iterations)
+    assert min(taken) > 0 and max(taken) <= most + 1 and max(taken) - min(taken) <= 1
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
@@ -479,6 +485,17 @@ def test_soft_data_anchor_a_hole_without_a_rim_however_weak_or_strong(strength, 
     solution = solve_poisson(hole, ~hole, np.zeros(hole.shape), guidance, chosen, weight=weight, anchor=anchor)
     assert not solution.unanchored.any()
     np.testing.assert_allclose(solution.values, guidance - guidance[4, 5] + 7, atol=1e-5)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-9, 1e-12, 0.0])
+def test_a_handful_of_pixels_on_a_weak_anchor(tolerance):
+    """One black unknown: float32 follows its residual to nothing, far below the true one."""
+    hole, guidance = np.ones((3, 1), bool), np.array([[0.3], [np.nan], [2.0]])
+    weight, anchor = np.array([[0.00358], [0.0], [0.0]]), np.array([[-578.4], [0.0], [0.0]])
+    given = hole, ~hole, np.zeros((3, 1)), guidance
+    solution = solve_poisson(*given, PoissonSettings(tolerance), weight=weight, anchor=anchor)
+    assert solution.iterations < 20
+    np.testing.assert_allclose(solution.values, -578.4, rtol=1e-5 if tolerance > 1e-9 else 1e-12)
 
 
 def test_several_weak_anchors_settle_the_constant():
