@@ -16,7 +16,7 @@ from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import contributions, footprint, render, surface_depth
+from ..raster import footprint, render, surface_depth
 from ..threads import parallel_map
 from .outline import (
     Window,
@@ -32,12 +32,12 @@ from .selection import (
     Selection,
     SelectionSettings,
     Sighting,
-    Weights,
     by_centre,
     object_and_rim,
     select,
     select_removed,
     weigh,
+    weigh_revealed,
     without_revealed,
 )
 from .surroundings import follow_surroundings
@@ -143,19 +143,15 @@ def find_masks(
             f"no usable view: of {len(cameras)} cameras {within} are inside the ROI and the others do not frame it; "
             "add views that look at it from outside"
         )
-    passes = _Passes(progress, 5 * len(seeing))
+    passes = _Passes(progress, 3 * len(seeing))
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
-    selection, weights = by_centre(inside), None
+    selection = by_centre(inside)
     if not settings.selection.by_centre:
-        selection, weights = _choose(gaussians, region, before, passes, settings.selection)
-    gone = passes.over(lambda b: _weight_of(gaussians, selection.removed, b.camera, settings), before)
-    hidden = [weight > settings.hides for weight in gone]
-    if weights is not None and settings.selection.support > 0:
-        revealed = _weight_on(gaussians, selection, before, hidden, passes)
-        selection = without_revealed(gaussians, selection, region, weights.clear, revealed, settings.selection)
-    untrusted = [h | ~b.agrees if b.extra is None else h | ~b.agrees | b.extra for b, h in zip(before, hidden)]
-    sight = Sight.make([(b.camera, b.depth, u) for b, u in zip(before, untrusted)])
-    after, needed = _empty(gaussians, selection, before, gone, sight, passes, settings)
+        selection = _choose(gaussians, region, before, passes, settings.selection)
+    kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
+    after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
+    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)])
+    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, settings), range(len(after)))
     mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
     if warnings or mode == "paper":
         mode = "paper"
@@ -266,7 +262,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 def _choose(
     gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
-) -> tuple[Selection, Weights | None]:
+) -> Selection:
     """Which Gaussians go, by what the views show of them."""
     depths = [(b.camera, b.depth) for b in before]
     surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
@@ -280,42 +276,36 @@ def _choose(
 
     sightings = passes.over(sighting, before)
     if not any(s.object_.sum() > settings.least_object * _polygon_pixels(b).sum() for s, b in zip(sightings, before)):
-        return by_centre(select_removed(gaussians, region)), None  # nothing stands out: the surface itself is meant
+        return by_centre(select_removed(gaussians, region))  # nothing stands out: the surface itself is meant
     weights = weigh(gaussians, sightings)
-    return select(gaussians, region, weights, surroundings, settings), weights
+    selection = select(gaussians, region, weights, surroundings, settings)
+    if settings.support == 0:
+        return selection
+    revealed = weigh_revealed(gaussians, selection, sightings)
+    return without_revealed(gaussians, selection, region, weights.clear, revealed, settings)
 
 
-def _weight_of(gaussians: Gaussians, removed: np.ndarray, camera: Camera, settings: MaskSettings) -> np.ndarray:
-    """[H, W]: blend weight of the removed Gaussians, with the object in place."""
-    window = gaussians_window(gaussians.take(removed), camera, settings.around)
-    weight = np.zeros((camera.height, camera.width), np.float32)
-    weight[window] = footprint(gaussians, cropped(camera, window), removed)
-    return weight
-
-
-def _empty(
+def _without(
     gaussians: Gaussians,
-    selection: Selection,
-    before: Sequence[_Before],
-    gone: Sequence[np.ndarray],  # [H, W] each, see _weight_of
-    sight: Sight,
-    passes: _Passes,
+    kept: Gaussians,
+    gone: Gaussians,
+    removed: np.ndarray,  # [N] bool
+    view: _Before,
     settings: MaskSettings,
-) -> tuple[list[_After], list[np.ndarray]]:
-    """Every view without the object, and where it then shows what no view saw, [H, W] bool each."""
-    kept, removed = gaussians.take(~selection.removed), gaussians.take(selection.removed)
+) -> _After:
+    """A view without the object; only the part that the object touched is drawn anew."""
+    window = gaussians_window(gone, view.camera, settings.around)
+    part = cropped(view.camera, window)
+    depth, alpha, weight = view.depth.copy(), view.alpha.copy(), np.zeros_like(view.alpha)
+    depth[window], alpha[window] = surface_depth(kept, part)
+    weight[window] = footprint(gaussians, part, removed)
+    return _After(depth, alpha, weight)
 
-    def without(k: int) -> tuple[_After, np.ndarray]:
-        """Only the part that the object touched is drawn anew."""
-        camera = before[k].camera
-        window = gaussians_window(removed, camera, settings.around)
-        depth, alpha = before[k].depth.copy(), before[k].alpha.copy()
-        depth[window], alpha[window] = surface_depth(kept, cropped(camera, window))
-        after = _After(depth, alpha, gone[k])
-        return after, _needed(camera, after, sight, settings)
 
-    found = passes.over(without, range(len(before)))
-    return [a for a, _ in found], [n for _, n in found]
+def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels that are no evidence of what is behind the object."""
+    hidden = (after.weight > settings.hides) | ~before.agrees
+    return hidden if before.extra is None else hidden | before.extra
 
 
 def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
@@ -328,24 +318,6 @@ def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings)
     evidence[rows, cols] = sight.shows(points, settings.depth_tolerance)
     evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
     return touched & ~evidence
-
-
-def _weight_on(
-    gaussians: Gaussians,
-    selection: Selection,
-    before: Sequence[_Before],
-    pixels: Sequence[np.ndarray],  # [H, W] bool each
-    passes: _Passes,
-) -> np.ndarray:
-    """[N]: blend weight of the kept Gaussians on those pixels of all views, without the object."""
-    stays = ~selection.removed
-    kept = gaussians.take(stays)
-    total = np.zeros(len(gaussians))
-    for part in passes.over(
-        lambda k: contributions(kept, before[k].camera, pixels=pixels[k]).total, range(len(pixels))
-    ):
-        total[stays] += part
-    return total
 
 
 def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: _Before, settings: MaskSettings) -> np.ndarray:

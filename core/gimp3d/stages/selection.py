@@ -205,12 +205,22 @@ def select(
     return Selection(fates)
 
 
+def weigh_revealed(gaussians: Gaussians, selection: Selection, sightings: Sequence[Sighting]) -> np.ndarray:
+    """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views."""
+    stays = ~selection.removed
+    kept = gaussians.take(stays)
+    total = np.zeros(len(gaussians))
+    for part in parallel_map(lambda s: contributions(kept, s.camera, pixels=s.object_).total, sightings):
+        total[stays] += part
+    return total
+
+
 def without_revealed(
     gaussians: Gaussians,
     selection: Selection,
     region: Region,
     clear: np.ndarray,  # [N] weight on what views showed unhidden, with the object in place
-    revealed: np.ndarray,  # [N] weight of the kept ones where the object was, without it
+    revealed: np.ndarray,  # [N], see weigh_revealed
     settings: SelectionSettings = SelectionSettings(),
 ) -> Selection:
     """Remove what the removal reveals near the region and no photo vouches for (METHOD section 1, contamination).

@@ -31,7 +31,8 @@ class SurroundingsSettings:
     cells: int = 800_000  # of the grid round one box at most
     least_cell: float = 1.5  # edge of a cell, pixels of a usual view
     least_points: int = 3  # in a cell that counts as surface
-    beyond: float = 0.25  # how far the grid reaches beyond the box, as a share of its longest edge
+    beyond: float = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
+    seeds: float = 0.1  # width of the grid's outer layer, where growth starts, as such a share
     views: int = 60  # at most so many, spread evenly, are gathered
     step: float = 0.6  # how far a cell may lie off the plane of those reached before it
     turn: float = 50.0  # degrees that its normal may differ from theirs
@@ -75,7 +76,7 @@ def follow_surroundings(
     settings: SurroundingsSettings = SurroundingsSettings(),
 ) -> Surroundings:
     """Follow the surface round a box into it."""
-    half = box.size / 2 + settings.beyond * box.size.max()
+    half = box.size * (0.5 + settings.beyond)
     pixel = float(np.median([abs(c.to_camera(box.center)[2]) / c.fx for c, _ in views]))
     points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
     least = pixel * max(settings.least_cell, math.sqrt(settings.least_points / points_per_cell))
@@ -97,7 +98,7 @@ def follow_surroundings(
     normals = _normals(moments, there)
     numbers = np.full(dims, -1, np.int32)
     numbers[there] = np.arange(len(points))
-    edge = (np.abs(points) > half - 0.1 * box.size.max()).any(1)
+    edge = (np.abs(points) > half - settings.seeds * box.size).any(1)
     reached = edge & ~in_region(region, box.center + points @ box.axes.T)
     limits = np.array([settings.step * cell, math.cos(math.radians(settings.turn)), settings.support, settings.adapt])
     planes = np.concatenate([points, normals], axis=1)

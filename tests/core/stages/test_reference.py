@@ -34,7 +34,7 @@ def test_the_steep_view_wins_over_the_grazing_one_and_the_cut_off_one() -> None:
     views = [
         camera_at("grazing", (2.2, 0, 0.5)),
         camera_at("steep", (0.8, 0.3, 2.0)),
-        camera_at("cut off", (0.8, 0.3, 2.0), (0.95, 0.9, 0)),
+        camera_at("cut off", (0.8, 0.3, 2.0), (0.85, 0.8, 0)),
     ]
     choice = choose_reference(find_masks(scene(), REGION, views).views)
     assert choice.camera_id == "steep" and choice.confidence == 1
