@@ -98,15 +98,11 @@ def complete_depth(
 
 def _remains(evidence: DepthEvidence, disparity: np.ndarray, hole: np.ndarray, settings: DepthSettings) -> np.ndarray:
     """[H, W] bool: small islands of evidence before the completed surface: splats of the object that were kept."""
-    there = evidence.weight > 0
-    islands, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(there, AROUND), AROUND)
-    if count == 0:
-        return there
-    area = np.bincount(islands[there], minlength=count + 1)
+    before = (evidence.weight > 0) & (evidence.disparity > (1 + settings.layers.step / 2) * disparity)
+    islands, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(before, AROUND), AROUND)
+    area = np.bincount(islands[before], minlength=count + 1)
     beside_rim = np.bincount(islands[~hole], minlength=count + 1) > 0
-    height = scipy.ndimage.median(evidence.disparity / np.maximum(disparity, 1e-12), islands * there, range(count + 1))
-    remains = (area < settings.least_island * hole.sum()) & ~beside_rim & (height > 1 + settings.layers.step / 2)
-    return there & remains[islands]
+    return before & (area < settings.least_island * hole.sum())[islands] & ~beside_rim[islands]
 
 
 def _without(evidence: DepthEvidence, dropped: np.ndarray) -> DepthEvidence:
