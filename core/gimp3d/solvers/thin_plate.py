@@ -23,8 +23,8 @@ class ThinPlateSettings:
     smoothing: float = 1.5  # px, σ below which the values' own noise is smoothed away
     tension: float = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
     unknowns: int = 4000  # at most; larger domains are solved on a coarser grid
-    reweighted: int = 1  # rounds of Tukey's biweight against outliers
-    outlier: float = 4.7  # standard deviations at which a value does not count (95 % efficiency)
+    stiff: float = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
+    outlier: float = 4.7  # standard deviations off the stiff plate at which a value does not count; inf: all count
 
 
 def thin_plate(
@@ -55,12 +55,13 @@ def thin_plate(
     parts, _ = scipy.ndimage.label(cells)
     cells &= np.isin(parts, parts[count > 0])
     radius = max(np.sqrt(wanted.sum() / np.pi), 1.0)
-    bending = _energy(cells, settings.smoothing**4 / stride**2, (settings.tension * radius / stride) ** -2)
-    coarse = np.full(cells.shape, np.nan)
-    robust = count
-    for _ in range(1 + settings.reweighted):
-        coarse[cells] = _minimum(bending, robust[cells], mean[cells])
-        robust = count * _biweight(coarse - mean, count > 0, settings.outlier)
+    pull = (settings.tension * radius / stride) ** -2
+    coarse, weights = np.full(cells.shape, np.nan), count
+    if np.isfinite(settings.outlier):
+        stiff = _energy(cells, settings.stiff**4 / stride**2, pull)
+        coarse[cells] = _minimum(stiff, count[cells], mean[cells])
+        weights = count * _biweight(coarse - mean, count > 0, settings.outlier)
+    coarse[cells] = _minimum(_energy(cells, settings.smoothing**4 / stride**2, pull), weights[cells], mean[cells])
     fine = _refined(coarse, cells, stride)[: domain.shape[0], : domain.shape[1]]
     inside = domain & np.repeat(np.repeat(cells, stride, 0), stride, 1)[: domain.shape[0], : domain.shape[1]]
     result[window] = np.where(inside, fine + trend, np.nan)
@@ -123,7 +124,7 @@ def _minimum(energy: scipy.sparse.csr_matrix, weight: np.ndarray, values: np.nda
 
 
 def _biweight(residual: np.ndarray, there: np.ndarray, outlier: float) -> np.ndarray:
-    """Tukey's weights of the residuals, never 0: a part of the domain must not lose its last value."""
+    """Tukey's weights of the residuals (95 % efficient at 4.7); never 0, lest a part of the domain lose all."""
     scale = 1.4826 * float(np.median(np.abs(residual[there])))
     share = np.where(there, np.abs(residual), 0.0) / (outlier * scale + 1e-300)
     return np.maximum(1 - np.minimum(share, 1.0) ** 2, 1e-3) ** 2

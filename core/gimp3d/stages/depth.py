@@ -12,7 +12,7 @@ import scipy.ndimage
 from ..errors import IllPosed
 from ..priors.monodepth import DepthPrior, relative_disparity
 from ..solvers.poisson import solve_poisson
-from .depth_evidence import DepthEvidence, gather_depth_evidence, pushed_back, seen_past
+from .depth_evidence import DepthEvidence, free_space, gather_depth_evidence
 from .depth_fill import DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
 from .layers import AROUND, distance_to, without_front
 from .masks import ViewMasks
@@ -59,22 +59,22 @@ def complete_depth(
     known = without_front(disparity, known, view.target, view.occluder, settings.layers)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
     evidence = gather_depth_evidence(view, views, settings.evidence)
+    ring = known & (distance_to(view.target) <= settings.planes.ring)
+    space = free_space(view, views, ring, settings.evidence)
 
     def complete(evidence: DepthEvidence | None) -> DepthCompletion:
         return complete_disparity(disparity, known, view.target, relative, settings, evidence)
 
-    def past(completed: DepthCompletion, where: np.ndarray) -> np.ndarray:
-        return seen_past(view, completed.depth, where, views, settings.evidence)
-
     done = complete(None)
     behind = (evidence.weight > 0) & (evidence.disparity < (1 - settings.layers.step) * done.disparity)
-    evidence = _without(evidence, behind & ~past(done, behind))
+    evidence = _without(evidence, behind & ~space.seen_past(done.depth, behind))
+    evidence = _without(evidence, _remains(evidence, done.disparity, view.target, settings))
     if (evidence.weight > 0).any():
         done = complete(evidence)
-    contradicted = past(done, view.target)
+    contradicted = space.seen_past(done.depth, view.target)
     pushed = int(contradicted.sum())
     if pushed:
-        moved = pushed_back(view, done.depth, contradicted, views, settings.evidence)
+        moved = space.pushed_back(done.depth, contradicted)
         there = moved > 0
         depth = np.where(there, moved, done.depth)
         done = replace(done, depth=depth, disparity=np.divide(1, depth, out=done.disparity.copy(), where=there))
@@ -94,6 +94,15 @@ def complete_depth(
         confidence=done.confidence * (1 - share),
         reason="; ".join(words),
     )
+
+
+def _remains(evidence: DepthEvidence, disparity: np.ndarray, hole: np.ndarray, settings: DepthSettings) -> np.ndarray:
+    """[H, W] bool: small islands of evidence before the completed surface: splats of the object that were kept."""
+    before = (evidence.weight > 0) & (evidence.disparity > (1 + settings.layers.step / 2) * disparity)
+    islands, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(before, AROUND), AROUND)
+    area = np.bincount(islands[before], minlength=count + 1)
+    beside_rim = np.bincount(islands[~hole], minlength=count + 1) > 0
+    return before & (area < settings.least_island * hole.sum())[islands] & ~beside_rim[islands]
 
 
 def _without(evidence: DepthEvidence, dropped: np.ndarray) -> DepthEvidence:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ class DepthEvidenceSettings:
     least_views: int = 2  # that must agree on a surface, or on there being none
     full: int = 4  # views that make a pixel as sure as one of the reference's own
     beyond: float = 0.03  # how far behind a point a view must see to see past it
+    far: float = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
     coarse: int = 4  # stride at which it is asked which parts of a view may show the hole
     push: float = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
     pushes: int = 40  # at most: to 50 times the distance
@@ -124,52 +125,83 @@ def _framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     return np.flatnonzero(inside), cols, rows, z[inside]
 
 
-def seen_past(
+@dataclass(frozen=True)
+class FreeSpace:
+    """Where views see through: no surface of the background can stand there."""
+
+    view: ViewMasks  # the reference
+    others: tuple[tuple[Camera, np.ndarray, np.ndarray], ...]  # camera, nearest and farthest z round each pixel
+    margin: int  # views by which those that see past must outnumber those that see a surface
+    settings: DepthEvidenceSettings
+
+    def seen_past(
+        self,
+        depth: np.ndarray,  # [H, W] completed z-depth
+        pixels: np.ndarray,  # [H, W] bool, those asked about
+    ) -> np.ndarray:
+        """[H, W] bool: pixels whose completed surface stands where views see through.
+
+        The reference sees the object, and nothing in front of it. Another view sees past a point if all it sees round
+        its pixel lies clearly behind; enough others must. Where a view sees nothing (alpha below ½), it says nothing.
+        """
+        rows, cols = np.nonzero(pixels & (depth > 0))
+        past, excess = self._votes(depth, rows, cols)
+        view, tolerance = self.view, 1 - self.settings.beyond
+        object_there = (view.depth_after <= 0) | (view.depth_before < tolerance * view.depth_after)
+        before_object = (depth < tolerance * view.depth_before) & (depth > self.settings.far * view.depth_before)
+        found = np.zeros(pixels.shape, bool)
+        found[rows, cols] = (past >= self.settings.least_views) & (excess > self.margin)
+        return found | (before_object & object_there & pixels & (depth > 0))
+
+    def pushed_back(
+        self,
+        depth: np.ndarray,  # [H, W] completed z-depth
+        contradicted: np.ndarray,  # [H, W] bool
+    ) -> np.ndarray:
+        """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
+
+        0 elsewhere, and where there is no such place within reach.
+        """
+        moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
+        for k in range(self.settings.pushes):
+            if not left.any():
+                break
+            moved = np.where(left, moved * (1 + self.settings.push * 1.1**k), moved)
+            left = self.seen_past(moved, left)
+        return np.where(left, 0.0, moved).astype(np.float32)
+
+    def _votes(self, depth: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Per pixel: the other views that see past it, and by how many more they are than those that see it."""
+        uv = np.stack([cols + 0.5, rows + 0.5], -1)
+        points = self.view.camera.unproject(uv, depth[rows, cols].astype(np.float64))
+        past, there = np.zeros(len(points), int), np.zeros(len(points), int)
+        for camera, nearest, farthest in self.others:
+            index, x, y, z = _framed(camera, points)
+            near, far = nearest[y, x], farthest[y, x]
+            past[index] += near > (1 + self.settings.beyond) * z
+            there[index] += (near <= (1 + self.settings.beyond) * z) & (far >= (1 - self.settings.beyond) * z)
+        return past, past - there
+
+
+def free_space(
     view: ViewMasks,  # the reference
-    depth: np.ndarray,  # [H, W] its completed z-depth
-    pixels: np.ndarray,  # [H, W] bool, those asked about
     views: Sequence[ViewMasks],
+    trusted: np.ndarray,  # [H, W] bool, the reference's own surfaces: what views say of them shows how far to trust it
     settings: DepthEvidenceSettings = DepthEvidenceSettings(),
-) -> np.ndarray:
-    """[H, W] bool: pixels whose completed surface stands where views see through (free space).
+) -> FreeSpace:
+    """What other views see through. The margin is what 95 % of the reference's own surfaces stay below.
 
-    The reference itself sees the object there, and nothing in front of it. Another view sees past a point if all it
-    sees round its pixel lies clearly behind. Enough others must, and more than see a surface at the point. Where a
-    view sees nothing (alpha below ½), it says nothing.
+    In scans with poor depths, views "see past" tables; they must then say so more clearly of the hole than of these.
     """
-    rows, cols = np.nonzero(pixels & (depth > 0))
-    z = depth[rows, cols].astype(np.float64)
-    points = view.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
-    past, there = np.zeros(len(points), int), np.zeros(len(points), int)
-    for other in views:
-        if other.camera.id == view.camera.id:
-            continue
-        index, x, y, far = _framed(other.camera, points)
-        nearest = cv2.erode(other.depth_before, np.ones((3, 3), np.uint8))[y, x]  # 0 where anything is void
-        farthest = cv2.dilate(other.depth_before, np.ones((3, 3), np.uint8))[y, x]
-        past[index] += nearest > (1 + settings.beyond) * far
-        there[index] += (nearest <= (1 + settings.beyond) * far) & (farthest >= (1 - settings.beyond) * far)
-    found = np.zeros(pixels.shape, bool)
-    before_object = z < (1 - settings.beyond) * view.depth_before[rows, cols]
-    found[rows, cols] = before_object | ((past >= settings.least_views) & (past > there))
-    return found
-
-
-def pushed_back(
-    view: ViewMasks,  # the reference
-    depth: np.ndarray,  # [H, W] completed z-depth
-    contradicted: np.ndarray,  # [H, W] bool
-    views: Sequence[ViewMasks],
-    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
-) -> np.ndarray:
-    """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
-
-    0 elsewhere, and where there is no such place within reach.
-    """
-    moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
-    for k in range(settings.pushes):
-        if not left.any():
-            break
-        moved = np.where(left, moved * (1 + settings.push * 1.1**k), moved)
-        left = seen_past(view, moved, left, views, settings)
-    return np.where(left, 0.0, moved).astype(np.float32)
+    around = np.ones((3, 3), np.uint8)
+    others = tuple(
+        (v.camera, cv2.erode(v.depth_before, around), cv2.dilate(v.depth_before, around))  # nearest 0: void is near
+        for v in views
+        if v.camera.id != view.camera.id
+    )
+    space = FreeSpace(view, others, 0, settings)
+    rows, cols = np.nonzero(trusted & (view.depth_after > 0))
+    if len(rows) == 0:
+        return space
+    excess = space._votes(view.depth_after, rows, cols)[1]
+    return replace(space, margin=max(0, int(np.percentile(excess, 95))))

@@ -54,8 +54,20 @@ def test_outliers_do_not_count():
     spoilt = np.where(rng.random((H, W)) < 0.05, plane + rng.uniform(-3, 3, (H, W)), plane)
     spoilt += 0.001 * rng.standard_normal((H, W))
     assert np.abs(thin_plate(spoilt, RING * 1.0, HOLE) - plane)[HOLE].mean() < 0.01
-    trusting = thin_plate(spoilt, RING * 1.0, HOLE, ThinPlateSettings(reweighted=0))
+    trusting = thin_plate(spoilt, RING * 1.0, HOLE, ThinPlateSettings(outlier=np.inf))
     assert np.abs(trusting - plane)[HOLE].mean() > 0.03
+
+
+def test_a_cluster_of_outliers_does_not_count():
+    """Remains of the object, an island in the hole: a plate that bends to them would make a mound."""
+    island = np.hypot(V - 48, U - 66) < 4
+    plane = 1 + 0.01 * U
+    values = np.where(island, 1.3 * plane, plane) + 0.002 * np.random.default_rng(0).standard_normal((H, W))
+    hole = HOLE & ~island
+    found = thin_plate(values, (RING | island) * 1.0, hole)
+    assert np.abs(found / plane - 1)[hole].max() < 0.02
+    bent = thin_plate(values, (RING | island) * 1.0, hole, ThinPlateSettings(outlier=np.inf))
+    assert np.abs(bent / plane - 1)[hole].max() > 0.2
 
 
 def test_noise_is_smoothed():
