@@ -40,7 +40,7 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, seen_past
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
@@ -201,7 +201,10 @@ def remove_object(
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
     if masks.hole_pixels == 0:
-        return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
+        why = "nothing to fill: every view sees what is behind the object"
+        if masks.mode == "paper":
+            why = "nothing to fill: what surrounds the box covers its outline in every view"
+        return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
     painted = {
         v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
@@ -261,7 +264,7 @@ def _fill_from_one_view(
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
     completed: DepthCompletion = run(
         f"depth{suffix}",
-        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given),
+        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given, first=not suffix),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     appearance: Appearance = run(
@@ -269,6 +272,8 @@ def _fill_from_one_view(
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
     seeds = seed_gaussians(view.camera, appearance.image, depth, view.target, filled.is_surfels, settings.seed)
+    shown = [(v.camera, v.depth_before, v.silhouette | v.target) for v in open_views]
+    seeds = seeds.take(~seen_past(seeds, shown, settings.seed))
     if len(seeds) == 0:
         raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)
@@ -335,9 +340,12 @@ def _complete_depth(
     base: np.ndarray,
     settings: RemovalSettings,
     given: np.ndarray | None,
+    first: bool = True,  # reference; a file's prior is of that view
 ) -> DepthCompletion:
     """The reference's depth; a model that estimates it looks at the picture given, or at a first fill."""
     picture, spec = None, settings.depth_prior
+    if spec.startswith("file:") and not first:
+        spec = "auto"
     if spec.startswith("onnx:"):
         if given is not None:
             picture = paste_picture(base, view.target, given, "--reference-image").image
@@ -390,7 +398,8 @@ def _appearance(
         return paste_picture(base, view.target, given, "--reference-image")
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
-        sources = [(v.camera, photos[v.camera.id], v.depth_before) for v in open_views]
+        # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
+        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)

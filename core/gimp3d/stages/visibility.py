@@ -75,8 +75,9 @@ def depth_agreement(
         framed = (z > 0) & (uv >= 0).all(1) & (uv < [width, height]).all(1)
         cols, rows = uv[framed].astype(int).T
         there, z = depths[other][rows, cols], z[framed]
-        through = (there > z * (1 + tolerance)) | (there == 0)
-        return np.array([(np.abs(there - z) <= tolerance * z).sum(), through.sum()])
+        coarse = max(tolerance, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
+        through = (there > z * (1 + coarse)) | (there == 0)
+        return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
 
     if len(cameras) < 2:
         return 1.0
