@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from chart import FAINT, Axis, Series, drawn, end_labels, frame, group_colours, in_words, page, text
+from chart import COLOURS, FAINT, Axis, Series, drawn, end_labels, frame, page, text
 from raster_report import table
 
 WIDTH, HEIGHT = 960, 470
 PLOT_WIDTH, PLOT_HEIGHT, TOP = 300, 280, 96
-LEFTS = (80, 560)  # room for the lines' names to the right of each plot
+LEFTS = (80, 545)  # room for the lines' names to the right of each plot
 CHART_TOLERANCE = 1e-6
+NAMES = ("gimp3d", "pyamg RS + CG", "SciPy CG", "spsolve", "splu")  # in the chart
 Row = dict[str, Any]
 
 
@@ -65,7 +66,7 @@ def comparison(rows: list[Row]) -> str:
                 + ("" if r["shape"] == "blob" else f", {r['shape']}")
                 + (", screened" if r["screened"] else ""),
                 f"{r['share']:.0%}",
-                in_words(r["unknowns"]),
+                f"{r['unknowns']:,}",
                 r["solver"],
                 "direct" if r["tolerance"] is None else f"{r['tolerance']:.0e}",
                 "not run to its end" if r["ms"] is None else f"{r['ms']:.1f}",
@@ -85,15 +86,16 @@ def key(row: Row) -> tuple[Any, ...]:
 def draw_chart(results: Row) -> str:
     """Time and iterations over the number of unknowns."""
     rows = [r for r in results["by_tolerance"] if r["ms"] is not None]
-    shown = [r for r in rows if r["tolerance"] in (CHART_TOLERANCE, None) and r["solver"] != "gimp3d float32"]
-    names = dict.fromkeys(r["solver"] for r in shown)
-    times = [Series(n, n, [(r["unknowns"], r["ms"]) for r in shown if r["solver"] == n]) for n in names]
-    steps = [
-        Series(n, n, [(r["unknowns"], r["iterations"]) for r in shown if r["solver"] == n])
-        for n in names
-        if any(r["iterations"] for r in shown if r["solver"] == n)
-    ]
-    colours = group_colours(times)
+    shown = [r for r in rows if r["tolerance"] in (CHART_TOLERANCE, None) and r["solver"] in NAMES]
+    times, steps = (
+        [
+            Series(name, name, points)
+            for name in NAMES
+            if (points := [(r["unknowns"], r[what]) for r in shown if r["solver"] == name and r[what]])
+        ]
+        for what in ("ms", "iterations")
+    )
+    colours = dict(zip(NAMES, (*COLOURS, FAINT)))
     parts = []
     for left, (heading, panel, label) in zip(
         LEFTS, (("Time", times, "CPU time, ms (log)"), ("Iterations", steps, "iterations (log)"))
@@ -109,7 +111,7 @@ def draw_chart(results: Row) -> str:
         for series in panel:
             parts += drawn(series, x_axis, y_axis, colours[series.group])
         parts += end_labels(panel, x_axis, y_axis, colours)
-    words = ", ".join(dict.fromkeys(f"{r['size']}" for r in shown))
+    words = ", ".join(dict.fromkeys(r["size"] for r in shown))
     parts.append(text(LEFTS[0], HEIGHT - 18, f"Holes of 8 % of a picture: {words}.", colour=FAINT))
     host = results["machine"]
     subtitle = f"residual 1e-6 (splu, spsolve: direct); one thread, {host['cpu']} ({host['vectors']})"

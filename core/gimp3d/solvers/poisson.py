@@ -28,6 +28,7 @@ class PoissonSettings:
     # Residual over that of the guidance plus one constant per component, each equation divided by its diagonal
     tolerance: float = 1e-5
     most_iterations: int = 150  # then a direct solve: only mazes of one-pixel walls get there (5 are usual)
+    # Of the result. float32 saves a quarter of the memory; its residual ends near 2e-6 of the first one.
     precision: Literal["float32", "float64"] = "float64"
 
 
