@@ -55,7 +55,7 @@ class MaskSettings:
     guard_scale: float = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
     guard_footprint: float = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
     changed: float = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
-    hides: float = 0.3  # blend weight of removed Gaussians above which a pixel shows nothing else
+    hides: float = 0.5  # blend weight of removed Gaussians above which a pixel shows nothing else
     solid: float = 0.9  # alpha after removal from which a surface counts as there
     void: float = 0.1  # alpha after removal below which there is nothing
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
@@ -160,8 +160,8 @@ def find_masks(
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
-    reason = "; ".join([*warnings, reason])
-    return Masks(selection, views, left_out, mode, len(views) / len(cameras), reason, warnings)
+    confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
+    return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), warnings)
 
 
 def _inconsistencies(before: Sequence[_Before], settings: MaskSettings) -> tuple[str, ...]:

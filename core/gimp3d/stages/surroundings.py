@@ -36,7 +36,8 @@ class SurroundingsSettings:
     views: int = 60  # at most so many, spread evenly, are gathered
     step: float = 0.6  # how far a cell may lie off the plane of those reached before it
     turn: float = 50.0  # degrees that its normal may differ from theirs
-    adapt: float = 0.25
+    steady: float = 20.0  # degrees up to which a cell's own normal bends the plane that it hands on …
+    adapt: float = 0.25  # … and with what weight
     support: int = 4  # cells within two that must have been reached before
     thickness: float = 0.5  # how far off its plane a point still belongs to the surface
 
@@ -82,11 +83,8 @@ def follow_surroundings(
     least = pixel * max(settings.least_cell, math.sqrt(settings.least_points / points_per_cell))
     cell = max(least, float((8 * half.prod() / settings.cells) ** (1 / 3)))
     dims = tuple(int(n) for n in np.ceil(2 * half / cell))
-    used = (
-        [views[k * len(views) // settings.views] for k in range(settings.views)]
-        if len(views) > settings.views
-        else views
-    )
+    count = min(len(views), settings.views)
+    used = [views[k * len(views) // count] for k in range(count)]
     found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
     local = np.concatenate(found)
     keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T), dims)
@@ -100,7 +98,8 @@ def follow_surroundings(
     numbers[there] = np.arange(len(points))
     edge = (np.abs(points) > half - settings.seeds * box.size).any(1)
     reached = edge & ~in_region(region, box.center + points @ box.axes.T)
-    limits = np.array([settings.step * cell, math.cos(math.radians(settings.turn)), settings.support, settings.adapt])
+    turn, steady = math.cos(math.radians(settings.turn)), math.cos(math.radians(settings.steady))
+    limits = np.array([settings.step * cell, turn, steady, settings.adapt, settings.support])
     planes = np.concatenate([points, normals], axis=1)
     _grow(numbers, np.argwhere(there), points, normals, limits, reached, planes)
     nearest = np.full(dims, -1, np.int32)
@@ -123,7 +122,7 @@ def _normals(
     moments: np.ndarray,  # [10, …] of the grid's cells
     there: np.ndarray,  # […] bool
 ) -> np.ndarray:
-    """The direction in which the points of a cell and its neighbours spread least, [M, 3]."""
+    """The direction in which the points of a cell and its neighbours spread least, [M, 3] (Hoppe 1992)."""
     total = np.stack([scipy.ndimage.uniform_filter(m, 3, mode="constant")[there] for m in moments])
     mean = total[1:4] / total[0]
     covariance = np.empty((total.shape[1], 3, 3))
@@ -134,12 +133,15 @@ def _normals(
 
 @exact_kernel
 def _grow(numbers, cells, points, normals, limits, reached, planes):
-    """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated."""
-    step, cosine, support, adapt = limits[0], limits[1], limits[2], limits[3]
+    """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated.
+
+    A cell hands on the plane that it was reached by, hardly bent by its own normal: at the foot of an object cells
+    hold both surfaces, and their normals would lead growth up its side.
+    """
+    step, turn, steady, adapt, support = limits[0], limits[1], limits[2], limits[3], limits[4]
     touched = np.zeros(len(cells), np.bool_)
     front = np.flatnonzero(reached)
     while len(front):
-        waiting = np.empty(0, np.int64)
         for row in front:
             for dx in range(-1, 2):
                 for dy in range(-1, 2):
@@ -172,9 +174,9 @@ def _grow(numbers, cells, points, normals, limits, reached, planes):
             p, n = points[row], normals[row]
             off = nx * (p[0] - px) + ny * (p[1] - py) + nz * (p[2] - pz)
             agreement = nx * n[0] + ny * n[1] + nz * n[2]
-            if abs(off) < step and abs(agreement) > cosine:
+            if abs(off) < step and abs(agreement) > turn:
                 accepted[w] = True
-                gain = adapt * (1.0 if agreement > 0 else -1.0) if abs(agreement) > 0.94 else 0.0
+                gain = math.copysign(adapt, agreement) if abs(agreement) > steady else 0.0
                 nx, ny, nz = nx + gain * n[0], ny + gain * n[1], nz + gain * n[2]
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
                 planes[row, 3], planes[row, 4], planes[row, 5] = nx / length, ny / length, nz / length
