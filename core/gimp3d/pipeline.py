@@ -40,7 +40,7 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, seen_past
+from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
@@ -272,8 +272,6 @@ def _fill_from_one_view(
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
     seeds = seed_gaussians(view.camera, appearance.image, depth, view.target, filled.is_surfels, settings.seed)
-    shown = [(v.camera, v.depth_before, v.silhouette | v.target) for v in open_views]
-    seeds = seeds.take(~seen_past(seeds, shown, settings.seed))
     if len(seeds) == 0:
         raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)

@@ -115,9 +115,9 @@ def test_noisy_depths_change_little_within_the_tolerance_of_the_tests(seed: int)
         with noisy_depths(share, seed):
             masks = find_masks(scene(), REGION, VIEWS)
         losses.append(changed(masks, unperturbed()))
-        # In proportion: a tenth of T per per cent. z-tests between views tolerate 2 %, and two views differ by √2 times
+        # In proportion: a fifth of T per per cent. z-tests between views tolerate 2 %, and two views differ by √2 times
         # the noise: at 1 % one test in six fails, at 3 % two in three, but a pixel is judged by more than one.
-        assert losses[-1] <= 10 * share + 0.02
+        assert losses[-1] <= 20 * share + 0.02
         assert covered(masks) >= 0.99
         # The surface is fitted to hundreds of pixels of the ring, so it is never as wrong as they are.
         assert depth_error(masks) < DEPTH + share

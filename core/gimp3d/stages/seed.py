@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from ..camera import Camera
@@ -27,9 +26,6 @@ class SeedSettings:
     sh_degree: int = 0  # of new Gaussians: on the benchmark scenes, degree 1 costs 0.5 dB in the mask and more unseen
     ridge: float = 1.0
     depth_tolerance: float = 0.02  # z-test of observations
-    free_margin: int = 2  # px round a place within which a view must look past it everywhere
-    free_beyond: float = 0.05  # how much farther (relative) it must look
-    free_views: int = 2  # so many such views forbid a Gaussian there
 
 
 def seed_gaussians(
@@ -68,27 +64,6 @@ def seed_gaussians(
         opacity_logits=np.full(len(z), np.log(settings.opacity / (1 - settings.opacity)), np.float32),
         sh=((colours - 0.5) / SH_C0)[:, None].astype(np.float32),
     )
-
-
-def seen_past(
-    seeds: Gaussians,
-    views: Sequence[
-        tuple[Camera, np.ndarray, np.ndarray]
-    ],  # (camera, z with the object [H, W], 0 = void; [H, W] hidden)
-    settings: SeedSettings = SeedSettings(),
-) -> np.ndarray:
-    """[N] bool: where views look past a place, at what lies behind it or at the void, nothing can stand."""
-    size = 2 * settings.free_margin + 1
-    count = np.zeros(len(seeds), int)
-    for camera, depth, hidden in views:
-        reach = np.where(hidden, 0, np.where(depth > 0, depth, np.inf)).astype(np.float32)
-        reach = cv2.erode(reach, np.ones((size, size), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-        uv, z = camera.project(seeds.means.astype(np.float64))
-        with np.errstate(invalid="ignore"):
-            framed = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-        cols, rows = uv[framed].astype(int).T
-        count[framed] += reach[rows, cols] > (1 + settings.free_beyond) * z[framed]
-    return count >= settings.free_views
 
 
 def colour_gaussians(
