@@ -284,13 +284,14 @@ def test_every_view_is_drawn_a_fixed_number_of_times(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["desk", "corner", "gloss", "rocks"])
-def test_targets_of_the_measured_scenes(shared_data: Path, name: str) -> None:
-    """At least 99 % of the never-seen pixels up to a 1-px rim, in at most 1.6 × their area; the object's own mask."""
+@pytest.mark.parametrize(("scale", "least", "most"), [(1.0, 0.99, 1.6), (0.8, 0.85, 1.6), (1.2, 0.99, 1.75)])
+def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: float, least: float, most: float) -> None:
+    """Share of the never-seen pixels up to a 1-px rim that T covers, and its area over theirs; the box a fifth off."""
     folder = shared_data / "withwithout" / name
     loaded = [load_view(c) for c in read_cameras(folder / "transforms.json") if c.split == "train"]
-    gaussians, region = read_ply(folder / "scene.ply").gaussians, read_region(folder / "roi.json")
-    views = [c for _, c in loaded]
-    masks = find_masks(gaussians, region, views, photos={c.id: p for p, c in loaded})
+    gaussians = read_ply(folder / "scene.ply").gaussians
+    region = tuple(replace(b, size=scale * b.size) for b in read_region(folder / "roi.json"))
+    masks = find_masks(gaussians, region, [c for _, c in loaded], photos={c.id: p for p, c in loaded})
     covered = area = unseen = inner = touched = either = 0
     for view in masks.views:
         stem = folder / "truth" / "images" / Path(view.camera.id).stem
@@ -299,8 +300,8 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str) -> None:
         covered, inner = covered + (view.target & core).sum(), inner + core.sum()
         area, unseen = area + view.target.sum(), unseen + hidden.sum()
         touched, either = touched + (view.silhouette & object_).sum(), either + (view.silhouette | object_).sum()
-    assert len(masks.views) == len(views) and masks.mode == "need"
-    assert covered >= 0.99 * inner
-    assert area <= 1.6 * unseen
+    assert len(masks.views) == len(loaded) and masks.mode == "need"
+    assert covered >= least * inner
+    assert area <= most * unseen
     assert touched >= 0.84 * either
-    assert masks.selection.count(Fate.KEPT_SURFACE) > 100
+    assert scale < 1 or masks.selection.count(Fate.KEPT_SURFACE) > 100
