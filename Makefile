@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-depth extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -31,12 +31,15 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster
+bench: bench-raster bench-depth
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
 	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
+
+bench-depth: $(READY)
+	$(BIN)/python scripts/bench_depth.py --data $(DATA)
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
