@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -31,7 +31,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson
+bench: bench-raster bench-surface bench-poisson bench-depth
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -43,6 +43,9 @@ bench-surface: $(READY)
 
 bench-poisson: $(READY)
 	$(BIN)/python scripts/bench_poisson.py
+
+bench-depth: $(READY)
+	$(BIN)/python scripts/bench_depth.py --data $(DATA)
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
