@@ -400,11 +400,9 @@ def sees(
 
 
 def _tidy(target: np.ndarray, allowed: np.ndarray, margin: int) -> np.ndarray:
-    """Close pinholes, drop single pixels unless there is nothing else, and grow within what the object touched."""
+    """Close pinholes, drop single pixels, and grow by a margin within what the object touched."""
     kernel = np.ones((3, 3), np.uint8)
     solid = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-    if not solid.any():
-        solid = target.astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     if margin:
         solid = cv2.dilate(solid, kernel, iterations=margin)
