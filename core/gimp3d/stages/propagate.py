@@ -298,7 +298,7 @@ def _warp(
     """The reference as this view sees it [h, w, 3] float32, and where there [h, w] it lies; NaN: not seen by it."""
     rows, cols = np.nonzero(wanted)
     colours = np.zeros((*wanted.shape, 3), np.float32)
-    u, v = np.full((2, *wanted.shape), np.nan, np.float32)
+    u, v = np.full((2, *wanted.shape), np.nan)
     run_ranges(
         _warp_range,
         len(rows),
