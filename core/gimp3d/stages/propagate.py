@@ -60,7 +60,7 @@ class PropagateSettings:
     smooth_tolerance: float = 0.005  # how far depths may differ within one surface when their noise is averaged
     seam: float = 0.05  # depth step between neighbours that parts two surfaces
     surroundings: float = 0.75  # width of what the blend looks at round the hole, over the root of the hole's area
-    mapped: float = 0.3  # weight of all mapped sources against the surroundings in learning the change of colours
+    mapped: float = 0.5  # weight of all mapped sources against the surroundings in learning the change of colours
     retarget: int = 32  # px round a source that is hidden or off-screen, searched for another; 0: none
     misfit: float = 25.0  # grey levels, RMS, up to which a patch found there is alike
     donors: int = 8  # views that may lend samples of sources that a view does not show ("sample" only); 0: none
@@ -191,9 +191,16 @@ def _map_of(reference: Reference, settings: PropagateSettings) -> _Map:
     rows, cols = (x.astype(np.int32) for x in np.nonzero(there))
     index = np.full(there.shape, -1, np.int32)
     index[rows, cols] = np.arange(len(rows))
-    sources = (np.ascontiguousarray(f[rows, cols], np.int32) for f in (reference.rows, reference.cols))
-    depth = np.ascontiguousarray(reference.depth, np.float32)
-    return _Map(reference, _pack(reference.camera), depth, rows, cols, *sources, index)
+    return _Map(
+        reference=reference,
+        camera=_pack(reference.camera),
+        depth=np.ascontiguousarray(reference.depth, np.float32),
+        rows=rows,
+        cols=cols,
+        source_rows=np.ascontiguousarray(reference.rows[rows, cols], np.int32),
+        source_cols=np.ascontiguousarray(reference.cols[rows, cols], np.int32),
+        index=index,
+    )
 
 
 @dataclass(frozen=True)
@@ -216,6 +223,9 @@ class _Lent:
 
 
 def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: PropagateSettings) -> PaintedView:
+    if not view.target.any():
+        nothing = np.zeros((0, 0, 3), np.uint8)
+        return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0])
     reach = max(LEAST_REACH, math.ceil(settings.surroundings * math.sqrt(view.target.sum())))
     near, top, left = _cropped(view, reach + settings.evidence_margin)
     evidence = evidence_pixels(near, settings)
@@ -224,7 +234,7 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
     photo = (~near.silhouette | evidence) & _same_surface(near, settings) & ~hole
     distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     depth = smooth_depth(near.depth_new, settings.smooth_tolerance)
-    wanted = hole | (photo & (distance <= reach)) if hole.any() else hole
+    wanted = hole | (photo & (distance <= reach))
     warped, u, v = _warp(mapped, near.camera, depth, wanted, settings)
     reached = ~np.isnan(u)
     painted, photo = hole & reached, photo & reached & wanted
@@ -240,18 +250,16 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         if settings.transfer == "learned":
             change = _learn(mapped, view, sources, base, warped, photo, hole, depth, u, v, reach, settings)
         raw = warped + change.of(warped).astype(np.float32)
-        blended = blend_band(base, raw, painted, photo & (distance <= BAND * reach), depth, change.offset, settings)
+        width = BAND * reach
+        blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
     rules[near.target & evidence] = Rule.EVIDENCE
     return PaintedView(view.camera.id, top, left, blended, _to_bytes(np.where(painted[..., None], raw, base)), rules)
 
 
 def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
-    """The part of the view round its target, and where it begins."""
-    spans = []
-    for axis in (0, 1):
-        there = np.flatnonzero(view.target.any(1 - axis))
-        spans.append(slice(max(0, int(there[0]) - margin), int(there[-1]) + margin + 1) if len(there) else slice(0, 0))
-    rows, cols = spans
+    """The part of the view round its target, which is not empty, and where it begins."""
+    there = (np.flatnonzero(view.target.any(1 - axis)) for axis in (0, 1))
+    rows, cols = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) for x in there)
     arrays = {
         name: getattr(view, name)[rows, cols]
         for name in ("image", "base", "silhouette", "target", "depth_before", "depth_new")
@@ -271,8 +279,6 @@ def _same_surface(view: ViewToPaint, settings: PropagateSettings) -> np.ndarray:
 def evidence_pixels(view: ViewToPaint, settings: PropagateSettings) -> np.ndarray:
     """[H, W] bool: pixels of T_t where the photo already shows the new surface, unhidden."""
     same = _same_surface(view, settings)
-    if not same.size:
-        return same
     hidden = cv2.morphologyEx((view.silhouette & ~same).astype(np.uint8), cv2.MORPH_OPEN, SQUARE)
     size = 2 * settings.evidence_margin + 1
     return view.target & same & (cv2.dilate(hidden, np.ones((size, size), np.uint8)) == 0)
@@ -385,15 +391,16 @@ def _learn(
     step = -(-count // MOST_PAIRS)
     rows, cols = (x[::step] for x in np.nonzero(both))
     blur = SMOOTHING * reach
-    pairs = [_blurred(x, both, blur)[rows, cols] for x in (warped, base - warped)]
+    colours, change = (_blurred(x, both, blur)[rows, cols] for x in (warped, base - warped))
     places, weights = _sector(rows, cols, hole), np.ones(len(rows))
     before, after = _mean_patches(mapped, view, sources, settings)
     if len(before):
         patches = _sector(before[:, 3], before[:, 4], mapped.index >= 0)
-        pairs = [np.concatenate([pairs[0], before[:, :3]]), np.concatenate([pairs[1], after - before[:, :3]])]
+        colours = np.concatenate([colours, before[:, :3]])
+        change = np.concatenate([change, after - before[:, :3]])
         places = np.concatenate([places, SECTORS + patches])
         weights = np.concatenate([weights, np.full(len(after), settings.mapped * len(rows) / len(after))])
-    return learn_change(*pairs, places, weights)
+    return learn_change(colours, change, places, weights)
 
 
 def _sector(rows: np.ndarray, cols: np.ndarray, region: np.ndarray) -> np.ndarray:
@@ -576,14 +583,16 @@ def blend_band(
     raw: np.ndarray,  # [H, W, 3] float32, the fill, in the hole and in the band
     painted: np.ndarray,  # [H, W] bool, where the fill is to be seen
     band: np.ndarray,  # [H, W] bool, photo round the hole that the fill must fit
+    width: float,  # px of the band: the correction follows the photo over about as much
     depth: np.ndarray,  # [H, W] z of the new scene
     offset: np.ndarray,  # [3] correction of parts that no band touches
     settings: PropagateSettings,
 ) -> np.ndarray:
-    """The fill with a smooth correction that fits it to the band, [H, W, 3] uint8: screened Poisson, not over seams.
+    """The fill with a smooth correction c that fits it to the band, [H, W, 3] uint8.
 
-    A rim of single pixels carries every pixel's texture and misregistration into the hole; the band's mean does not.
-    Gradients of the fill are those of the raw fill but for the correction's, which the Laplace equation spreads.
+    Minimises Σ |∇c|² + 2/width² Σ_band (c − mismatch)²: Poisson blending (guidance: the fill's own gradients) with a
+    soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole. Depth seams
+    stop the correction.
     """
     result = base.copy()
     if not painted.any():
@@ -591,8 +600,6 @@ def blend_band(
     whole = painted | band
     domain = whole & ~_behind_seams(whole, depth, settings.seam)
     data = band & domain
-    # the correction follows the band over about a third of its width
-    width = 1 + cv2.distanceTransform(data.astype(np.uint8), cv2.DIST_L2, 3).max()
     mismatch = np.where(data[..., None], base - raw, 0)
     solution = solve_poisson(
         domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=2.0 * data / width**2, anchor=mismatch
@@ -911,9 +918,7 @@ def _sample_range(
                     continue
                 # the patch at (a, b) explains this pixel by its source at the same place within the patch
                 uq, vq = source_cols[m] - dx + (u0 - j0), source_rows[m] - dy + (v0 - i0)
-                ut, vt, good = _shown(
-                    uq, vq, ref, ref_depth, ref_source, camera, depth_before, silhouette, tolerance
-                )
+                ut, vt, good = _shown(uq, vq, ref, ref_depth, ref_source, camera, depth_before, silhouette, tolerance)
                 if not good:
                     continue
                 weight = math.exp(-0.5 * (dx * dx + dy * dy))
