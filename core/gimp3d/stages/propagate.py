@@ -184,6 +184,7 @@ class _Map:
     source_rows: np.ndarray  # [M] int32, f
     source_cols: np.ndarray
     index: np.ndarray  # [H, W] int32, each pixel's place in the list; -1 = none
+    true: np.ndarray  # [H, W] bool, pixels that show what is there: photo or completed
 
 
 def _map_of(reference: Reference, settings: PropagateSettings) -> _Map:
@@ -200,6 +201,7 @@ def _map_of(reference: Reference, settings: PropagateSettings) -> _Map:
         source_rows=np.ascontiguousarray(reference.rows[rows, cols], np.int32),
         source_cols=np.ascontiguousarray(reference.cols[rows, cols], np.int32),
         index=index,
+        true=reference.source | reference.target,
     )
 
 
@@ -222,6 +224,27 @@ class _Lent:
     gain: np.ndarray  # [3] its exposure over the reference's
 
 
+@dataclass(frozen=True)
+class _Warp:
+    """The reference as a part of a view sees it."""
+
+    colours: np.ndarray  # [h, w, 3] float32
+    u: np.ndarray  # [h, w] where it lies in the reference; NaN: the reference does not show it, or nobody asked
+    v: np.ndarray
+
+    @property
+    def reached(self) -> np.ndarray:
+        return ~np.isnan(self.u)
+
+    def lookup(
+        self,
+        picture: np.ndarray,  # [H, W, ...] of the reference
+        where: np.ndarray,  # [h, w] bool, reached
+    ) -> np.ndarray:
+        """The picture's values at those pixels, [N, ...]."""
+        return picture[self.v[where].astype(int), self.u[where].astype(int)]
+
+
 def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: PropagateSettings) -> PaintedView:
     if not view.target.any():
         nothing = np.zeros((0, 0, 3), np.uint8)
@@ -231,25 +254,24 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
     evidence = evidence_pixels(near, settings)
     hole = near.target & ~evidence
     base = np.where(evidence[..., None], near.image, near.base)
-    photo = (~near.silhouette | evidence) & _same_surface(near, settings) & ~hole
     distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    photo = (~near.silhouette | evidence) & _same_surface(near, settings) & ~hole & (distance <= reach)
     depth = smooth_depth(near.depth_new, settings.smooth_tolerance)
-    wanted = hole | (photo & (distance <= reach))
-    warped, u, v = _warp(mapped, near.camera, depth, wanted, settings)
-    reached = ~np.isnan(u)
-    painted, photo = hole & reached, photo & reached & wanted
-    true = mapped.reference.source | mapped.reference.target
-    photo[photo] = true[v[photo].astype(int), u[photo].astype(int)]
+    warp = _warp(mapped, near.camera, depth, hole | photo, settings)
+    painted, photo = hole & warp.reached, photo & warp.reached
+    photo[photo] = warp.lookup(mapped.true, photo)
     sources = _find_sources(mapped, view, settings)
-    rules = _rules_of(mapped, sources, u, v, hole)
+    rules = _rules_of(mapped, sources, warp, hole)
     if settings.transfer == "sample":
-        raw, rules = _sample(mapped, view, sources, lent, warped, u, v, rules, settings)
+        raw, rules = _sample(mapped, view, sources, lent, warp, rules, settings)
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette & ~evidence, depth, settings)
     else:
         change = NO_CHANGE
         if settings.transfer == "learned":
-            change = _learn(mapped, view, sources, base, warped, photo, hole, depth, u, v, reach, settings)
-        raw = warped + change.of(warped).astype(np.float32)
+            alike = photo & _flat(depth, settings.seam)
+            alike[alike] = warp.lookup(mapped.reference.source, alike)
+            change = _learn(mapped, view, sources, warp.colours, base - warp.colours, alike, hole, reach, settings)
+        raw = warp.colours + change.of(warp.colours).astype(np.float32)
         width = BAND * reach
         blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
     rules[near.target & evidence] = Rule.EVIDENCE
@@ -298,10 +320,7 @@ def smooth_depth(
     return out
 
 
-def _warp(
-    mapped: _Map, camera: Camera, depth: np.ndarray, wanted: np.ndarray, settings: PropagateSettings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The reference as this view sees it [h, w, 3] float32, and where there [h, w] it lies; NaN: not seen by it."""
+def _warp(mapped: _Map, camera: Camera, depth: np.ndarray, wanted: np.ndarray, settings: PropagateSettings) -> _Warp:
     rows, cols = np.nonzero(wanted)
     colours = np.zeros((*wanted.shape, 3), np.float32)
     u, v = np.full((2, *wanted.shape), np.nan)
@@ -320,7 +339,7 @@ def _warp(
         u,
         v,
     )
-    return colours, u, v
+    return _Warp(colours, u, v)
 
 
 def _find_sources(mapped: _Map, view: ViewToPaint, settings: PropagateSettings) -> _Sources:
@@ -353,14 +372,13 @@ def _find_sources(mapped: _Map, view: ViewToPaint, settings: PropagateSettings) 
     return _Sources(rows, cols, rules)
 
 
-def _rules_of(mapped: _Map, sources: _Sources, u: np.ndarray, v: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def _rules_of(mapped: _Map, sources: _Sources, warp: _Warp, hole: np.ndarray) -> np.ndarray:
     """[h, w] uint8: the rule of each pixel of the hole by the source of the reference pixel that it shows."""
-    rules = np.zeros(hole.shape, np.uint8)
-    rules[hole] = Rule.UNREACHED
-    rows, cols = np.nonzero(hole & ~np.isnan(u))
-    listed = mapped.index[v[rows, cols].astype(int), u[rows, cols].astype(int)]
-    found = np.where(listed >= 0, sources.rules[listed] if len(sources.rules) else 0, 0)
-    rules[rows, cols] = np.where(found > 0, found, Rule.REFERENCE)
+    rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
+    reached = hole & warp.reached
+    listed = warp.lookup(mapped.index, reached)
+    found = np.append(sources.rules, 0)[listed]  # -1, which is not in the list, is the last
+    rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
     return rules
 
 
@@ -368,13 +386,10 @@ def _learn(
     mapped: _Map,
     view: ViewToPaint,
     sources: _Sources,
-    base: np.ndarray,  # [h, w, 3]
     warped: np.ndarray,  # [h, w, 3]
-    photo: np.ndarray,  # [h, w] bool
+    difference: np.ndarray,  # [h, w, 3], the view less the warped reference
+    alike: np.ndarray,  # [h, w] bool, pixels round the hole that both show
     hole: np.ndarray,  # [h, w] bool
-    depth: np.ndarray,  # [h, w]
-    u: np.ndarray,  # [h, w]
-    v: np.ndarray,  # [h, w]
     reach: int,
     settings: PropagateSettings,
 ) -> ColourChange:
@@ -383,23 +398,18 @@ def _learn(
     What depends on the place (a highlight) comes into the hole from its rim, by the blend; what depends on the colour,
     hence on the material and on the exposure, is learned.
     """
-    both = photo & _flat(depth, settings.seam)
-    both[both] = mapped.reference.source[v[both].astype(int), u[both].astype(int)]
-    count = int(both.sum())
+    count = int(alike.sum())
     if not count:
         return NO_CHANGE
-    step = -(-count // MOST_PAIRS)
-    rows, cols = (x[::step] for x in np.nonzero(both))
-    blur = SMOOTHING * reach
-    colours, change = (_blurred(x, both, blur)[rows, cols] for x in (warped, base - warped))
+    rows, cols = (x[:: -(-count // MOST_PAIRS)] for x in np.nonzero(alike))
+    colours, change = (_blurred(x, alike, SMOOTHING * reach)[rows, cols] for x in (warped, difference))
     places, weights = _sector(rows, cols, hole), np.ones(len(rows))
-    before, after = _mean_patches(mapped, view, sources, settings)
-    if len(before):
-        patches = _sector(before[:, 3], before[:, 4], mapped.index >= 0)
-        colours = np.concatenate([colours, before[:, :3]])
-        change = np.concatenate([change, after - before[:, :3]])
-        places = np.concatenate([places, SECTORS + patches])
-        weights = np.concatenate([weights, np.full(len(after), settings.mapped * len(rows) / len(after))])
+    patches, patch_colours, patch_change = _mean_patches(mapped, view, sources, settings)
+    if len(patches):
+        colours, change = np.concatenate([colours, patch_colours]), np.concatenate([change, patch_change])
+        beyond = _sector(sources.rows[patches], sources.cols[patches], mapped.index >= 0)
+        places = np.concatenate([places, SECTORS + beyond])
+        weights = np.concatenate([weights, np.full(len(patches), settings.mapped * len(rows) / len(patches))])
     return learn_change(colours, change, places, weights)
 
 
@@ -425,11 +435,11 @@ def _blurred(values: np.ndarray, where: np.ndarray, sigma: float) -> np.ndarray:
 
 def _mean_patches(
     mapped: _Map, view: ViewToPaint, sources: _Sources, settings: PropagateSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colours of source patches: [K, 5] in the reference with their row and column there, [K, 3] in the view."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Some of the sources that the view shows [K], their patches' mean colours in the reference and change [K, 3]."""
     shown = np.flatnonzero(sources.rules)
     shown = shown[:: max(1, -(-len(shown) // MOST_PATCHES))]
-    before, after = np.zeros((len(shown), 5)), np.zeros((len(shown), 3))
+    colours, change = np.zeros((2, len(shown), 3))
     run_ranges(
         _mean_range,
         len(shown),
@@ -445,10 +455,10 @@ def _mean_patches(
         view.image,
         settings.depth_tolerance,
         settings.patch // 2,
-        before,
-        after,
+        colours,
+        change,
     )
-    return before, after
+    return shown, colours, change
 
 
 def _sample(
@@ -456,23 +466,21 @@ def _sample(
     view: ViewToPaint,
     sources: _Sources,
     lent: Sequence[_Lent],
-    warped: np.ndarray,
-    u: np.ndarray,
-    v: np.ndarray,
+    warp: _Warp,
     rules: np.ndarray,
     settings: PropagateSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole."""
     borrowed, has = _borrowed(mapped, view, sources, lent, settings)
-    raw, rules = warped.copy(), rules.copy()
-    rows, cols = np.nonzero(~np.isnan(u) & (rules > 0))
+    raw, rules = warp.colours.copy(), rules.copy()
+    rows, cols = np.nonzero(warp.reached & (rules > 0))
     run_ranges(
         _sample_range,
         len(rows),
         rows,
         cols,
-        u,
-        v,
+        warp.u,
+        warp.v,
         mapped.index,
         mapped.camera,
         mapped.depth,
@@ -853,8 +861,8 @@ def _mean_range(
     image,
     tolerance,
     radius,
-    before,  # [K, 5] out
-    after,  # [K, 3] out
+    colours,  # [K, 3] out
+    change,  # [K, 3] out
 ):
     for k in range(lo, hi):
         count = 0.0
@@ -867,12 +875,11 @@ def _mean_range(
                 if good:
                     count += 1.0
                     for channel in range(3):
-                        before[k, channel] += ref_image[a, b, channel]
-                        after[k, channel] += _bilinear(image, ut, vt, channel)
+                        colours[k, channel] += ref_image[a, b, channel]
+                        change[k, channel] += _bilinear(image, ut, vt, channel) - ref_image[a, b, channel]
         for channel in range(3):
-            before[k, channel] /= count  # the patch's centre is shown
-            after[k, channel] /= count
-        before[k, 3], before[k, 4] = rows[k], cols[k]
+            colours[k, channel] /= count  # not 0: the patch's centre is shown
+            change[k, channel] /= count
 
 
 @kernel
