@@ -72,7 +72,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", support=0.0),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
-        propagate=PropagateSettings(transfer="sample"),
+        propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,
         extra_references=0,

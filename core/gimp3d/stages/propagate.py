@@ -23,6 +23,7 @@ from ..solvers.poisson import solve_poisson
 from ..threads import parallel_map, run_ranges
 
 TRANSFERS = ("learned", "sample", "none")
+BLENDS = ("band", "rim")
 SECTORS = 8  # places round the hole that predict one another
 LEAST_REACH = 16  # px
 MOST_PAIRS = 4000  # of the surroundings that colours are learned from
@@ -53,6 +54,7 @@ class PropagateSettings:
 
     transfer: str = "learned"  # "learned": the reference's colours, changed as this view's pixels tell; "sample": the
     # colours of this view's mapped sources (paper); "none": the warped reference
+    blend: str = "band"  # "band": fitted to the photo round the hole; "rim": to the rim's pixels alone (paper)
     patch: int = 5  # overlapping patches that are compared and blended (paper 4.1: 5 × 5)
     depth_tolerance: float = 0.02  # z-test
     evidence_tolerance: float = 0.006  # how near the photo's own surface must be to the new one to be taken as it
@@ -149,10 +151,11 @@ def propagate(
     Raises
     ------
     BadInput
-        If the transfer is unknown.
+        If the transfer or the blend is unknown.
     """
-    if settings.transfer not in TRANSFERS:
-        raise BadInput(f"propagate: unknown transfer {settings.transfer!r}; use {', '.join(TRANSFERS)}")
+    for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
+        if value not in known:
+            raise BadInput(f"propagate: unknown {name} {value!r}; use {', '.join(known)}")
     mapped = _map_of(reference, settings)
     lent = _lent_colours(mapped, views, settings) if settings.transfer == "sample" else ()
     done = 0
@@ -166,7 +169,7 @@ def propagate(
         return painted
 
     painted = tuple(parallel_map(paint, views))
-    counts = np.sum([np.bincount(p.rules.ravel(), minlength=len(Rule)) for p in painted], axis=0, initial=0)
+    counts = sum((np.bincount(p.rules.ravel(), minlength=len(Rule)) for p in painted), np.zeros(len(Rule), int))
     total = max(1, counts[1:].sum())
     shares = ", ".join(f"{counts[r] / total:.0%} {r.name.lower().replace('_', ' ')}" for r in list(Rule)[1:])
     return Propagation(painted, float(1 - counts[Rule.UNREACHED] / total), shares)
@@ -262,16 +265,17 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
     photo[photo] = warp.lookup(mapped.true, photo)
     sources = _find_sources(mapped, view, settings)
     rules = _rules_of(mapped, sources, warp, hole)
+    raw, change = warp.colours, NO_CHANGE
     if settings.transfer == "sample":
         raw, rules = _sample(mapped, view, sources, lent, warp, rules, settings)
+    elif settings.transfer == "learned":
+        alike = photo & _flat(depth, settings.seam)
+        alike[alike] = warp.lookup(mapped.reference.source, alike)
+        change = _learn(mapped, view, sources, warp.colours, base - warp.colours, alike, hole, reach, settings)
+        raw = warp.colours + change.of(warp.colours).astype(np.float32)
+    if settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette & ~evidence, depth, settings)
     else:
-        change = NO_CHANGE
-        if settings.transfer == "learned":
-            alike = photo & _flat(depth, settings.seam)
-            alike[alike] = warp.lookup(mapped.reference.source, alike)
-            change = _learn(mapped, view, sources, warp.colours, base - warp.colours, alike, hole, reach, settings)
-        raw = warp.colours + change.of(warp.colours).astype(np.float32)
         width = BAND * reach
         blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
     rules[near.target & evidence] = Rule.EVIDENCE
@@ -405,7 +409,7 @@ def _learn(
     colours, change = (_blurred(x, alike, SMOOTHING * reach)[rows, cols] for x in (warped, difference))
     places, weights = _sector(rows, cols, hole), np.ones(len(rows))
     patches, patch_colours, patch_change = _mean_patches(mapped, view, sources, settings)
-    if len(patches):
+    if len(patches) and settings.mapped > 0:
         colours, change = np.concatenate([colours, patch_colours]), np.concatenate([change, patch_change])
         beyond = _sector(sources.rows[patches], sources.cols[patches], mapped.index >= 0)
         places = np.concatenate([places, SECTORS + beyond])
@@ -614,11 +618,7 @@ def blend_band(
     )
     known = domain & ~solution.unanchored
     correction = np.where(known[..., None], solution.values, offset)
-    beside = painted & ~domain
-    if beside.any():  # pixels left out at a seam go with their own surface, which goes on beside them
-        spread = _blurred(correction, known, 1.0)
-        touched = cv2.dilate(known.astype(np.uint8), SQUARE) > 0
-        correction[beside & touched] = spread[beside & touched]
+    _continue_over(painted & ~domain, known, depth, settings.seam, correction)
     result[painted] = _to_bytes(raw[painted] + correction[painted])
     return result
 
@@ -633,6 +633,20 @@ def _behind_seams(region: np.ndarray, depth: np.ndarray, seam: float) -> np.ndar
         behind[b] |= parted & (step > 0)
         behind[a] |= parted & (step < 0)
     return behind
+
+
+def _continue_over(left_out: np.ndarray, known: np.ndarray, depth: np.ndarray, seam: float, values: np.ndarray) -> None:
+    """Give pixels that were left out at a seam the mean value [H, W, 3] of their own surface beside them."""
+    rows, cols = np.nonzero(left_out)
+    total, count = np.zeros((len(rows), 3)), np.zeros(len(rows))
+    for dy, dx in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        i, j = np.clip(rows + dy, 0, depth.shape[0] - 1), np.clip(cols + dx, 0, depth.shape[1] - 1)
+        here, there = depth[rows, cols], depth[i, j]
+        same = known[i, j] & (np.abs(here - there) < seam * np.minimum(here, there))
+        total[same] += values[i[same], j[same]]
+        count += same
+    found = count > 0
+    values[rows[found], cols[found]] = total[found] / count[found, None]
 
 
 def _to_bytes(colours: np.ndarray) -> np.ndarray:
