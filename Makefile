@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-propagate extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -37,6 +37,9 @@ bench: bench-raster
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
 	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
+
+bench-propagate: $(READY)
+	$(BIN)/python scripts/bench_propagate.py $(DATA)
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
