@@ -279,13 +279,20 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         width = BAND * reach
         blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
     rules[near.target & evidence] = Rule.EVIDENCE
-    return PaintedView(view.camera.id, top, left, blended, _to_bytes(np.where(painted[..., None], raw, base)), rules)
+    rows, cols = _bounds(near.target, 0)
+    return PaintedView(
+        view.camera.id,
+        top + rows.start,
+        left + cols.start,
+        blended[rows, cols].copy(),
+        _to_bytes(np.where(painted[..., None], raw, base)[rows, cols]),
+        rules[rows, cols].copy(),
+    )
 
 
 def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
     """The part of the view round its target, which is not empty, and where it begins."""
-    there = (np.flatnonzero(view.target.any(1 - axis)) for axis in (0, 1))
-    rows, cols = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) for x in there)
+    rows, cols = _bounds(view.target, margin)
     arrays = {
         name: getattr(view, name)[rows, cols]
         for name in ("image", "base", "silhouette", "target", "depth_before", "depth_new")
@@ -294,6 +301,13 @@ def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
     height, width = arrays["target"].shape
     camera = replace(c, width=width, height=height, cx=c.cx - cols.start, cy=c.cy - rows.start)
     return ViewToPaint(camera, **arrays), rows.start, cols.start
+
+
+def _bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns that hold the mask, which is not empty, and a margin."""
+    there = (np.flatnonzero(mask.any(1 - axis)) for axis in (0, 1))
+    rows, cols = (slice(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) for x in there)
+    return rows, cols
 
 
 def _same_surface(view: ViewToPaint, settings: PropagateSettings) -> np.ndarray:
