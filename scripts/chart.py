@@ -18,7 +18,7 @@ class Series:
     name: str
     group: str  # series of a group have one colour
     points: list[tuple[float, float]]
-    shape: str = "line"  # line, diamond, square or dashed: a dashed line with open marks
+    shape: str = "line"  # line or dashed, with dots or rings; dot, ring, diamond or square: marks alone
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,9 @@ def group_colours(series: Sequence[Series]) -> dict[str, str]:
 
 
 def mark(shape: str, x: float, y: float, colour: str) -> str:
-    if shape == "line":
+    if shape in ("line", "dot"):
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}"/>'
-    if shape == "dashed":
+    if shape in ("dashed", "ring"):
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="#ffffff" stroke="{colour}" stroke-width="1.5"/>'
     turn = f' transform="rotate(45 {x:.1f} {y:.1f})"' if shape == "diamond" else ""
     return (
