@@ -28,7 +28,7 @@ SECTORS = 8  # places round the hole that predict one another
 LEAST_REACH = 16  # px
 MOST_PAIRS = 4000  # of the surroundings that colours are learned from
 MOST_PATCHES = 2000  # of the mapped sources
-SMOOTHING = 1 / 30  # of the reach: the standard deviation by which pairs are blurred, against misregistration
+SMOOTHING = 1 / 20  # of the reach: half the side of the square that pairs are means of, against misregistration
 BAND = 1 / 8  # of the reach: the strip round the hole that the blend is fitted to
 SQUARE = np.ones((3, 3), np.uint8)
 
@@ -420,7 +420,8 @@ def _learn(
     if not count:
         return NO_CHANGE
     rows, cols = (x[:: -(-count // MOST_PAIRS)] for x in np.nonzero(alike))
-    colours, change = (_blurred(x, alike, SMOOTHING * reach)[rows, cols] for x in (warped, difference))
+    radius = max(1, round(SMOOTHING * reach))
+    colours, change = (_blurred(x, alike, radius)[rows, cols] for x in (warped, difference))
     places, weights = _sector(rows, cols, hole), np.ones(len(rows))
     patches, patch_colours, patch_change = _mean_patches(mapped, view, sources, settings)
     if len(patches) and settings.mapped > 0:
@@ -444,10 +445,11 @@ def _flat(depth: np.ndarray, seam: float) -> np.ndarray:
     return (cv2.dilate(depth, SQUARE) - nearest) < seam * depth
 
 
-def _blurred(values: np.ndarray, where: np.ndarray, sigma: float) -> np.ndarray:
-    """The values' Gaussian means over the pixels `where`, [h, w, 3]."""
-    weight = cv2.GaussianBlur(where.astype(np.float32), (0, 0), sigma)
-    total = cv2.GaussianBlur((values * where[..., None]).astype(np.float32), (0, 0), sigma)
+def _blurred(values: np.ndarray, where: np.ndarray, radius: int) -> np.ndarray:
+    """The values' means over the pixels `where` of a square, [h, w, 3]."""
+    side = (2 * radius + 1, 2 * radius + 1)
+    weight = cv2.blur(where.astype(np.float32), side)
+    total = cv2.blur((values * where[..., None]).astype(np.float32), side)
     return total / np.maximum(weight, 1e-6)[..., None]
 
 
