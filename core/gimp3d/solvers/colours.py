@@ -18,7 +18,7 @@ class ColourChange:
 
     centre: np.ndarray  # [3] grey levels
     matrix: np.ndarray  # [3, 3]
-    offset: np.ndarray  # [3] median change
+    offset: np.ndarray  # [3] change of the centre, if that is one of exposure
     trust: float  # 0 to 1
 
     def of(
@@ -64,7 +64,19 @@ def learn_change(
         error = np.sqrt(np.sum((np.array(explained) - best * np.array(wanted)) ** 2)) / sum(wanted)
         trust = float(np.clip(best - error, 0.0, 1.0))
     centre = np.average(colours, axis=0, weights=weights)
-    return ColourChange(centre, matrix, np.median(change[weights > 0], axis=0), trust)
+    kept = weights * _biweight(y - x @ matrix)
+    slopes = (kept[:, None] * x * y).sum(0) / ((kept[:, None] * x * x).sum(0) + LEAST_NOISE**2 * kept.sum() + 1e-9)
+    return ColourChange(
+        centre, matrix, _exposure(np.median(change[weights > 0], axis=0), trust * slopes * centre), trust
+    )
+
+
+def _exposure(level: np.ndarray, proportional: np.ndarray) -> np.ndarray:
+    """[3] the median change, if it is that of another exposure: twice as much for colours twice as bright.
+
+    Any other level (a highlight, a reflection, pairs of different surfaces) belongs to its place and not to others.
+    """
+    return level * np.clip(1 - 2 * np.abs(level - proportional) / np.maximum(np.abs(level), 1e-12), 0.0, 1.0)
 
 
 def _within_places(values: np.ndarray, places: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -29,6 +29,8 @@ LEAST_REACH = 16  # px
 MOST_PAIRS = 4000  # of the surroundings that colours are learned from
 MOST_PATCHES = 2000  # of the mapped sources
 SMOOTHING = 1 / 20  # of the reach: half the side of the square that pairs are means of, against misregistration
+LEAST_BAND = 20  # px that tell a part's level
+HOLD = 1 / 16  # how strongly a correction is held at its level where the band is far, over the band's own weight's root
 BAND = 1 / 8  # of the reach: the strip round the hole that the blend is fitted to
 SQUARE = np.ones((3, 3), np.uint8)
 
@@ -613,14 +615,14 @@ def blend_band(
     band: np.ndarray,  # [H, W] bool, photo round the hole that the fill must fit
     width: float,  # px of the band: the correction follows the photo over about as much
     depth: np.ndarray,  # [H, W] z of the new scene
-    offset: np.ndarray,  # [3] correction of parts that no band touches
+    offset: np.ndarray,  # [3] level of parts that no band touches
     settings: PropagateSettings,
 ) -> np.ndarray:
     """The fill with a smooth correction c that fits it to the band, [H, W, 3] uint8.
 
-    Minimises Σ |∇c|² + 2/width² Σ_band (c − mismatch)²: Poisson blending (guidance: the fill's own gradients) with a
-    soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole. Depth seams
-    stop the correction.
+    Minimises Σ |∇c|² + Σ_band w (c − mismatch)² + h Σ (c − level)²: Poisson blending (guidance: the fill's gradients)
+    with a soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole. The
+    weak hold h lets what few pixels say fade with the distance. Depth seams stop the correction.
     """
     result = base.copy()
     if not painted.any():
@@ -629,14 +631,27 @@ def blend_band(
     domain = whole & ~_behind_seams(whole, depth, settings.seam)
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
-    solution = solve_poisson(
-        domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=2.0 * data / width**2, anchor=mismatch
-    )
-    known = domain & ~solution.unanchored
-    correction = np.where(known[..., None], solution.values, offset)
-    _continue_over(painted & ~domain, known, depth, settings.seam, correction)
+    level = _levels(domain, data, mismatch, offset)
+    weight, hold = 2 / width**2 * data, (HOLD / width) ** 2
+    anchor = (weight[..., None] * mismatch + hold * level) / (weight + hold)[..., None]
+    correction = solve_poisson(
+        domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=weight + hold, anchor=anchor
+    ).values
+    correction[~domain] = offset
+    _continue_over(painted & ~domain, domain, depth, settings.seam, correction)
     result[painted] = _to_bytes(raw[painted] + correction[painted])
     return result
+
+
+def _levels(domain: np.ndarray, data: np.ndarray, values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """[H, W, 3]: the median of each connected part's data, where there are enough of them."""
+    level = np.broadcast_to(otherwise, values.shape).astype(np.float64)
+    _, parts = cv2.connectedComponents(domain.astype(np.uint8), connectivity=4)
+    found, counts = np.unique(parts[data], return_counts=True)
+    for part in found[counts >= LEAST_BAND]:
+        inside = parts == part
+        level[inside] = np.median(values[inside & data], axis=0)
+    return level
 
 
 def _behind_seams(region: np.ndarray, depth: np.ndarray, seam: float) -> np.ndarray:

@@ -60,7 +60,7 @@ def test_an_exposure_is_found_in_full() -> None:
     change = -0.4 * colours + np.random.default_rng(2).normal(0, 2, colours.shape)
     learned = learn_change(colours, change, places, weights)
     np.testing.assert_allclose(learned.trust * learned.matrix, -0.4 * np.eye(3), atol=0.02)
-    np.testing.assert_allclose(learned.offset, np.median(change, axis=0), atol=1e-9)
+    np.testing.assert_allclose(learned.offset, np.median(change, axis=0), rtol=0.1)
 
 
 def test_pairs_without_weight_count_for_nothing() -> None:
@@ -79,9 +79,16 @@ def test_few_pairs_teach_nothing(count: int) -> None:
     assert learn_change(*(x[:count] for x in pairs(noise=0.0))) is NO_CHANGE
 
 
-def test_colours_that_do_not_vary_teach_their_offset_only() -> None:
+def test_a_highlight_is_no_exposure() -> None:
+    """All colours became lighter by the same: that may end where the pairs do."""
+    colours, _, places, weights = pairs(noise=0.0)
+    change = 40 + np.random.default_rng(3).normal(0, 2, colours.shape)
+    np.testing.assert_allclose(learn_change(colours, change, places, weights).offset, 0.0, atol=1.0)
+
+
+def test_colours_that_do_not_vary_teach_nothing_of_others() -> None:
     colours = np.full((500, 3), 90.0)
     places = np.arange(500) % 8
     learned = learn_change(colours, np.full((500, 3), -12.0), places, np.ones(500))
     np.testing.assert_allclose(learned.of(np.array([10.0, 90.0, 200.0])), 0.0, atol=1e-9)
-    np.testing.assert_allclose(learned.offset, -12.0)
+    np.testing.assert_allclose(learned.offset, 0.0, atol=1e-9)
