@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -18,7 +18,8 @@ from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
-from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
+from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from .stages.propagate import (
@@ -41,6 +42,7 @@ from .stages.reference import (
     rim,
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
 R = TypeVar("R")
@@ -70,8 +72,8 @@ PRESETS: dict[str, RemovalSettings] = {
     "balanced": RemovalSettings(),
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
-        masks=MaskSettings(mode="paper", support=0.0),
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
+        masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,
@@ -94,10 +96,12 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | depth | appearance | mapping | rules
+    kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    data: tuple[np.ndarray, ...]  # per kind: (target) | (depth, target) | (target) | (rows, cols) | (rules)
+    data: tuple[
+        np.ndarray, ...
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,7 @@ class RemovalResult:
     pictures: tuple[Picture, ...] = ()
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
+    selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
 
 
 class Store(Protocol):
@@ -164,6 +169,7 @@ def remove_object(
     reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
     progress: Progress = silent,
     store: Store | None = None,
+    extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
 
@@ -184,9 +190,11 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
-    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress))
-    keep = ~masks.removed
     photos = {v.camera.id: v.image for v in views}
+    cameras = [v.camera for v in views]
+    masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
+    run.warnings += masks.warnings
+    keep = ~masks.removed
     for v in _spread(masks.views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if not masks.removed.any():
@@ -194,7 +202,10 @@ def remove_object(
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
     if masks.hole_pixels == 0:
-        return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
+        why = "nothing to fill: every view sees what is behind the object"
+        if masks.mode == "paper":
+            why = "nothing to fill: what surrounds the box covers its outline in every view"
+        return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
     painted = {
         v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
@@ -252,7 +263,10 @@ def _fill_from_one_view(
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
-    completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
+    completed: DepthCompletion = run(
+        f"depth{suffix}",
+        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given, first=not suffix),
+    )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
@@ -294,6 +308,7 @@ def _fill_from_one_view(
     name = view.camera.id
     run.pictures += [
         Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
+        *_fit_picture(completed, appearance.image, name),
         Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
         Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
         *(
@@ -321,13 +336,54 @@ def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearan
     return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
 
 
-def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
-    prior = depth_prior(settings.depth_prior, view.camera.height, view.camera.width)
-    surface = settings.depth_prior if settings.depth_prior in ("harmonic", "planar") else settings.depth.surface
+def _complete_depth(
+    view: ViewMasks,
+    open_views: Sequence[ViewMasks],
+    base: np.ndarray,
+    settings: RemovalSettings,
+    given: np.ndarray | None,
+    first: bool = True,  # reference; a file's prior is of that view
+) -> DepthCompletion:
+    """The reference's depth; a model that estimates it looks at the picture given, or at a first fill."""
+    picture, spec = None, settings.depth_prior
+    if spec.startswith("file:") and not first:
+        spec = "auto"
+    if spec.startswith("onnx:"):
+        if given is not None:
+            picture = paste_picture(base, view.target, given, "--reference-image").image
+        else:
+            picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
+    prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
+    surface = spec if spec in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
-    return complete_disparity(
-        disparity_of(view.depth_after), known, view.target, prior, replace(settings.depth, surface=surface)
+    return complete_depth(
+        view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)
     )
+
+
+def preview(
+    view: ViewMasks, views: Sequence[ViewMasks], picture: np.ndarray, settings: RemovalSettings = RemovalSettings()
+) -> tuple[Picture, ...]:
+    """What a removal would do in a view: where it would fill, on what surface, and how a depth prior was scaled."""
+    name = view.camera.id
+    shown = [Picture("mask", f"Region to fill in {name}", picture, (view.target,))]
+    if view.target.any():
+        try:
+            completed = _complete_depth(view, views, picture, settings, None)
+        except IllPosed:
+            return tuple(shown)  # the region is worth seeing all the more
+        depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
+        shown.append(Picture("depth", f"Completed surface in {name}", picture, (depth, view.target)))
+        shown += _fit_picture(completed, picture, name)
+    return tuple(shown)
+
+
+def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
+    """How the depth prior was scaled, if there was one."""
+    if len(completed.gradients) == 0:
+        return []
+    data = (completed.gradients, np.array([completed.scale_factor]))
+    return [Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data)]
 
 
 def _appearance(
@@ -344,7 +400,8 @@ def _appearance(
         return paste_picture(base, view.target, given, "--reference-image")
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
-        sources = [(v.camera, photos[v.camera.id], v.depth_before) for v in open_views]
+        # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
+        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
@@ -411,6 +468,7 @@ def _finish(
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
+        selection=masks.selection.counts,
     )
 
 
@@ -419,6 +477,7 @@ STORED = (
     Camera,
     Gaussians,
     Masks,
+    Selection,
     ViewMasks,
     ReferenceChoice,
     ViewScore,

@@ -335,7 +335,7 @@ def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
         log_scales=columns([f"scale_{k}" for k in range(scale_count)]),
         quats=columns([f"rot_{k}" for k in range(4)]),
         opacity_logits=columns(["opacity"])[:, 0],
-        sh=np.concatenate([dc[:, None], higher.transpose(0, 2, 1)], axis=1),
+        sh=np.ascontiguousarray(np.concatenate([dc[:, None], higher.transpose(0, 2, 1)], axis=1)),
         antialiased=any(ANTIALIASED.search(c) for c in table.comments),
     )
 
