@@ -39,7 +39,7 @@ class Rule(IntEnum):
     """How a pixel of T_t got its colour."""
 
     UNTOUCHED = 0
-    EVIDENCE = 1  # the photo shows the new surface itself here (the box held more than the object)
+    EVIDENCE = 1  # the photo shows the new surface itself here: T reaches beyond the object
     OWN_PIXELS = 2  # by the view's own pixels at the mapped source
     REFERENCE = 3  # the warped reference colour: no source to be seen
     UNREACHED = 4  # the reference does not see this surface
@@ -60,7 +60,6 @@ class PropagateSettings:
     patch: int = 5  # overlapping patches that are compared and blended (paper 4.1: 5 × 5)
     depth_tolerance: float = 0.02  # z-test
     evidence_tolerance: float = 0.006  # how near the photo's own surface must be to the new one to be taken as it
-    evidence_margin: int = 3  # px that evidence keeps away from the object
     smooth_tolerance: float = 0.005  # how far depths may differ within one surface when their noise is averaged
     seam: float = 0.05  # depth step between neighbours that parts two surfaces
     surroundings: float = 0.75  # width of what the blend looks at round the hole, over the root of the hole's area
@@ -255,12 +254,13 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         nothing = np.zeros((0, 0, 3), np.uint8)
         return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0])
     reach = max(LEAST_REACH, math.ceil(settings.surroundings * math.sqrt(view.target.sum())))
-    near, top, left = _cropped(view, reach + settings.evidence_margin)
-    evidence = evidence_pixels(near, settings)
+    near, top, left = _cropped(view, reach)
+    same = _same_surface(near, settings)
+    evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
     hole = near.target & ~evidence
     base = np.where(evidence[..., None], near.image, near.base)
     distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    photo = (~near.silhouette | evidence) & _same_surface(near, settings) & ~hole & (distance <= reach)
+    photo = ~near.silhouette & same & ~hole & (distance <= reach)
     depth = smooth_depth(near.depth_new, settings.smooth_tolerance)
     warp = _warp(mapped, near.camera, depth, hole | photo, settings)
     painted, photo = hole & warp.reached, photo & warp.reached
@@ -276,7 +276,7 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         change = _learn(mapped, view, sources, warp.colours, base - warp.colours, alike, hole, reach, settings)
         raw = warp.colours + change.of(warp.colours).astype(np.float32)
     if settings.blend == "rim":
-        blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette & ~evidence, depth, settings)
+        blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth, settings)
     else:
         width = BAND * reach
         blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
@@ -316,14 +316,6 @@ def _same_surface(view: ViewToPaint, settings: PropagateSettings) -> np.ndarray:
     """[H, W] bool: the photo's surface is the new one."""
     near = np.abs(view.depth_before - view.depth_new) < settings.evidence_tolerance * view.depth_new
     return (view.depth_before > 0) & (view.depth_new > 0) & near
-
-
-def evidence_pixels(view: ViewToPaint, settings: PropagateSettings) -> np.ndarray:
-    """[H, W] bool: pixels of T_t where the photo already shows the new surface, unhidden."""
-    same = _same_surface(view, settings)
-    hidden = cv2.morphologyEx((view.silhouette & ~same).astype(np.uint8), cv2.MORPH_OPEN, SQUARE)
-    size = 2 * settings.evidence_margin + 1
-    return view.target & same & (cv2.dilate(hidden, np.ones((size, size), np.uint8)) == 0)
 
 
 def smooth_depth(
