@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate extension \
+	screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -46,6 +47,9 @@ bench-poisson: $(READY)
 
 bench-depth: $(READY)
 	$(BIN)/python scripts/bench_depth.py --data $(DATA)
+
+bench-propagate: $(READY)
+	$(BIN)/python scripts/bench_propagate.py $(DATA)
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

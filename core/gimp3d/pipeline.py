@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -73,7 +74,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
-        propagate=PropagateSettings(transfer="sample"),
+        propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(sh_degree=3, ridge=1e-3),
         use_evidence=False,
         extra_references=0,
@@ -235,8 +236,8 @@ def remove_object(
             break
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
-        painted.update({p.camera_id: p.image for p in painting.views})
-        rules = {p.camera_id: p.rules for p in painting.views}
+        painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
+        rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         open_views = _all_still_open(open_views, filled, len(added), rules)
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
@@ -275,18 +276,13 @@ def _fill_from_one_view(
     if len(seeds) == 0:
         raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)
-    to_paint = parallel_map(
-        lambda v: ViewToPaint(
-            v.camera,
-            photos[v.camera.id],
-            painted[v.camera.id],
-            v.silhouette,
-            v.target,
-            v.depth_before,
-            surface_depth(with_seeds, v.camera)[0],
-        ),
-        open_views,
-    )
+
+    def to_paint(v: ViewMasks) -> ViewToPaint:
+        name = v.camera.id
+        depth_new = surface_depth(with_seeds, v.camera)[0]
+        return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
+
+    loaders = [partial(to_paint, v) for v in open_views]
     source = ~view.target & ~view.silhouette & (depth > 0)
     field_: MappingField = run(
         f"mapping{suffix}",
@@ -304,9 +300,9 @@ def _fill_from_one_view(
             settings.random_seed,
         ),
     )
-    reference = Reference(view.camera, appearance.image, depth, view.target, field_.rows, field_.cols)
+    reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
     painting: Propagation = run(
-        f"propagate{suffix}", lambda: propagate(reference, to_paint, settings.propagate, run.progress)
+        f"propagate{suffix}", lambda: propagate(reference, loaders, settings.propagate, run.progress)
     )
     painting = _with_reference(painting, view, appearance)
     name = view.camera.id
@@ -315,11 +311,19 @@ def _fill_from_one_view(
         *_fit_picture(completed, appearance.image, name),
         Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
         Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
-        *(Picture("rules", f"Filled view {p.camera_id}", p.image, (p.rules,)) for p in _spread(painting.views)),
+        *(
+            Picture(
+                "rules",
+                f"Filled view {p.camera_id}",
+                p.pasted(painted[p.camera_id]),
+                (p.rule_map(*painted[p.camera_id].shape[:2]),),
+            )
+            for p in _spread(painting.views)
+        ),
     ]
     new: Gaussians = run(
         f"seed{suffix}",
-        lambda: colour_gaussians(seeds, view.camera, to_paint, painting.views, filled.sh_degree, settings.seed),
+        lambda: colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
@@ -328,7 +332,7 @@ def _fill_from_one_view(
 def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearance) -> Propagation:
     """The reference itself shows its own completed picture, not a mapped one."""
     rules = np.where(view.target, Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    own = PaintedView(view.camera.id, appearance.image, appearance.image, rules)
+    own = PaintedView(view.camera.id, 0, 0, appearance.image, appearance.image, rules)
     return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
 
 
