@@ -17,6 +17,7 @@ from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
+from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -72,7 +73,7 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", support=0.0),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
         propagate=PropagateSettings(transfer="sample"),
-        seed=SeedSettings(sh_degree=3, ridge=1e-3),
+        seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         use_evidence=False,
         extra_references=0,
     ),
