@@ -36,11 +36,13 @@ HIGHEST = 3  # degree of 3DGS's files
 
 STEPS = (np.float32(1), np.float32(16))  # ridges tried, in units of the least one
 FIRST_STEP = np.float32(4)  # ridge of the first fit, whose errors give the robust weights
-FEW = np.float32(10)  # observations: below it the floor grows, or five with one wrong among them would lead the colour astray
+FEW = np.float32(10)  # observations; below it the least ridge grows: one wrong among five would lead it astray
+NARROW = np.float32(0.1)  # radians: of a much narrower cone, differences are noise that slopes would blow up
 CUT = np.float32(3)  # robust scale in σ
 POOLED = np.float32(10)  # observations' worth of σ_0 in a Gaussian's own σ
 GAIN = np.float32(1.02)  # the constant's squared error must exceed a fit's by this
 COLLINEAR = np.float32(1e-3)  # least ratio of the variances of the directions across and along their main axis
+SAME = np.float32(1e-5)  # scatter of directions, C1² square radians: below it (0.4°), they are one
 LEAST_RIDGE = np.float32(2e-6)  # of A's largest diagonal term, for float32
 LEAST_LEFT = np.float32(1e-3)  # of 1 − leverage
 HALVINGS = 20  # of the interval that holds a median
@@ -57,7 +59,9 @@ NORMAL, RIGHT = 0, 120 * LANES
 LOW, INVERSE, PROJECTED = 165 * LANES, 285 * LANES, 405 * LANES
 COEFFICIENTS, ANCHOR, TOWARDS, COLOUR = 450 * LANES, 495 * LANES, 510 * LANES, 513 * LANES
 SUM_ERROR, SUM_LEVERAGE = 516 * LANES, 519 * LANES  # a plane per degree
-TOTAL, RIDGE, BEST, FOUND, CHOSEN, RANK, GROUP = range(522 * LANES, 529 * LANES, LANES)
+MOMENT, MEAN = 522 * LANES, 537 * LANES  # Σ w x, and L⁻¹ of their mean
+OFFSET = 552 * LANES  # of the views' colours
+TOTAL, SHARE, RIDGE, BEST, FOUND, CHOSEN, RANK, GROUP = range(555 * LANES, 563 * LANES, LANES)
 
 ZERO, HALF, ONE, HUGE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e30), np.float32(1e-12)
 F1 = np.float32(C1)
@@ -80,6 +84,7 @@ class HarmonicsSettings:
     """How strongly the colours of few directions are held to the reference's colour."""
 
     floor: float = 0.2  # of the ridge, in observations, for a cone of directions of about 60° (see fit_harmonics)
+    trust: float = math.inf  # in observations, that the views' colours are not all off by as much; 0: they may well be
     ridge: float | None = None  # this ridge and the highest degree for all, the paper's weights: nothing is chosen
 
 
@@ -145,7 +150,7 @@ def rotate_sh(
     sh: np.ndarray,  # [N, K, 3], K = 1, 4, 9 or 16
     rotation: np.ndarray,  # [3, 3] or [N, 3, 3] proper or improper, from the old frame to the new one
 ) -> np.ndarray:
-    """Coefficients [N, K, 3] of the colours that are seen along R ω as `sh`'s are along ω.
+    """Coefficients [N, K, 3], of `sh`'s type, of the colours that are seen along R ω as `sh`'s are along ω.
 
     A rotation maps every band to itself (Wigner 1931): Y(R ω) = D(R) Y(ω). Evaluated in fixed directions, that is a
     small exact system for the orthogonal matrix D; no recursion is needed up to degree 3.
@@ -204,8 +209,12 @@ def fit_harmonics(
        ridge gives all degrees, and the errors come in closed form, (c − ĉ) / (1 − leverage).
 
     Leave-one-out sees nothing outside the cone of directions, where a fit goes on. The ridge therefore never falls
-    below floor · s · (1 + FEW / n) observations: n is the sum of the weights, s the RMS distance of the unit vectors
-    ω from ω_0.
+    below floor · (s + NARROW) · (1 + FEW / n) observations: n is the sum of the weights, s the RMS distance of the
+    unit vectors ω from ω_0.
+
+    Where the reference is lit otherwise than the views (another exposure, a shadow that is gone), every residual
+    holds the same offset, and a fit through c_0 would bend the colour towards it. With a finite `trust`, a common
+    offset is fitted along, with `trust` as its ridge, and left out of the result.
 
     Degree 0, c_0 alone, for Gaussians without observations and where the directions, seen from ω_0, do not span a
     patch of the sphere (rank test: one view, duplicates, a line).
@@ -228,9 +237,9 @@ def fit_harmonics(
     if shapes != ((n, 3), (n, 3), (n + 1,), (m, 3), (m, 3)) or offsets[0] != 0 or offsets[-1] != m:
         raise BadInput(f"SH fit: {n} Gaussians and {m} observations do not match arrays of shape {shapes}")
     counts = np.diff(offsets)
-    if n and (counts < 0).any() or not (np.isfinite(anchors).all() and np.isfinite(anchor_directions).all()):
+    if (counts < 0).any() or not (np.isfinite(anchors).all() and np.isfinite(anchor_directions).all()):
         raise BadInput("SH fit: offsets must not fall, and anchors must be finite")
-    sigma = _sigma_of(anchors, offsets, colours, weights)
+    sigma = _sigma_of(anchors, offsets, directions, colours, weights)
     fit = HarmonicsFit(
         np.zeros((n, (degree + 1) ** 2, 3), np.float32),
         np.zeros(n, np.uint8),
@@ -253,6 +262,7 @@ def fit_harmonics(
         degree,
         np.float32(sigma),
         np.float32(settings.floor),
+        np.float32(settings.trust),
         np.float32(-1 if settings.ridge is None else settings.ridge),
         fit.sh,
         fit.degree,
@@ -263,14 +273,18 @@ def fit_harmonics(
     return fit
 
 
-def _sigma_of(anchors: np.ndarray, offsets: np.ndarray, colours: np.ndarray, weights: np.ndarray) -> float:
+def _sigma_of(
+    anchors: np.ndarray, offsets: np.ndarray, directions: np.ndarray, colours: np.ndarray, weights: np.ndarray
+) -> float:
     """σ_0: the robust size of all residuals, from evenly spaced ones if there are very many."""
-    chosen = np.arange(0, len(weights), max(1, len(weights) // SAMPLE))
-    chosen = chosen[weights[chosen] > 0]
-    owner = np.searchsorted(offsets, chosen, side="right") - 1
-    sizes = np.linalg.norm(colours[chosen] - anchors[owner], axis=-1)
-    sizes = sizes[np.isfinite(sizes)]
-    return max(MAD * float(np.median(sizes)), LEAST_SIGMA) if len(sizes) else LEAST_SIGMA
+    rows = np.arange(0, len(weights), max(1, len(weights) // SAMPLE))
+    finite = np.isfinite(weights[rows]) & np.isfinite(directions[rows]).all(1) & np.isfinite(colours[rows]).all(1)
+    rows = rows[finite & (weights[rows] > 0)]
+    if len(rows) == 0:
+        return LEAST_SIGMA
+    owners = np.searchsorted(offsets, rows, side="right") - 1
+    sizes = np.linalg.norm(colours[rows].astype(np.float64) - anchors[owners], axis=-1)
+    return max(MAD * float(np.median(sizes)), LEAST_SIGMA)
 
 
 @exact_kernel
@@ -287,6 +301,7 @@ def _fit_groups(
     degree,
     sigma,
     floor,
+    trust,
     ridge,  # < 0: chosen per Gaussian
     sh,
     degrees,
@@ -303,13 +318,13 @@ def _fit_groups(
         rows = order[group * LANES : (group + 1) * LANES]
         count = _stage(rows, offsets, directions, colours, weights, anchors, anchor_directions, staged, s)
         _expand(count, degree, sigma, staged, s)
-        _normal_equations(count, k, staged, s)
+        _normal_equations(count, k, trust, staged, s)
         if ridge < ZERO and degree > 0:
             _set_ridge(FIRST_STEP * floor, s)
             _factorise(k, ONE, s)
             _leave_one_out(count, degree, staged, s)
             _reweigh(count, sigma, staged, s)
-            _normal_equations(count, k, staged, s)
+            _normal_equations(count, k, trust, staged, s)
         _start_constant(count, ridge < ZERO, staged, s)
         if degree > 0:
             _rank_test(s)
@@ -433,19 +448,21 @@ def _basis(degree, source, start, out, at):
 
 
 @exact_kernel
-def _normal_equations(count, k, staged, s):
-    """A = Σ w x xᵀ (packed rows), b = Σ w x rᵀ, Σ w."""
+def _normal_equations(count, k, trust, staged, s):
+    """A = Σ w x xᵀ (packed rows), b = Σ w x rᵀ, Σ w, with the views' common offset eliminated."""
     for p in range(NORMAL, LOW, LANES):
         store16(s, p, splat16(ZERO))
-    total = splat16(ZERO)
+    for p in range(MOMENT, MOMENT + K * LANES, LANES):
+        store16(s, p, splat16(ZERO))
+    total, red, green, blue = splat16(ZERO), splat16(ZERO), splat16(ZERO), splat16(ZERO)
     for v in range(count):
         at = v * STAGED
         w = load16(staged, at + WEIGHT)
-        total = total + w
         r = load16(staged, at + RESIDUAL)
         g = load16(staged, at + RESIDUAL + LANES)
         b = load16(staged, at + RESIDUAL + 2 * LANES)
-        p, q = NORMAL, RIGHT
+        total, red, green, blue = total + w, fma16(w, r, red), fma16(w, g, green), fma16(w, b, blue)
+        p, q, m = NORMAL, RIGHT, MOMENT
         for i in range(k):
             wx = w * load16(staged, at + i * LANES)
             for j in range(i + 1):
@@ -454,23 +471,42 @@ def _normal_equations(count, k, staged, s):
             store16(s, q, fma16(wx, r, load16(s, q)))
             store16(s, q + LANES, fma16(wx, g, load16(s, q + LANES)))
             store16(s, q + 2 * LANES, fma16(wx, b, load16(s, q + 2 * LANES)))
+            store16(s, m, wx + load16(s, m))
             q += 3 * LANES
-    store16(s, TOTAL, max16(total, TINY))
+            m += LANES
+    total = max16(total, TINY)
+    share = splat16(ONE) / (total + trust)
+    red, green, blue = red * share, green * share, blue * share
+    store16(s, TOTAL, total)
+    store16(s, SHARE, share)
+    store16(s, OFFSET, red)
+    store16(s, OFFSET + LANES, green)
+    store16(s, OFFSET + 2 * LANES, blue)
+    p, q = NORMAL, RIGHT
+    for i in range(k):
+        moment = load16(s, MOMENT + i * LANES)
+        for j in range(i + 1):
+            store16(s, p, load16(s, p) - moment * load16(s, MOMENT + j * LANES) * share)
+            p += LANES
+        store16(s, q, load16(s, q) - moment * red)
+        store16(s, q + LANES, load16(s, q + LANES) - moment * green)
+        store16(s, q + 2 * LANES, load16(s, q + 2 * LANES) - moment * blue)
+        q += 3 * LANES
 
 
 @exact_kernel
 def _set_ridge(floor, s):
-    """The least ridge, from the directions' RMS distance from ω_0."""
+    """The least ridge, from the directions' RMS distance from ω_0, or from their mean if there is an offset."""
     # the first three basis functions are the direction's coordinates times ±C1
     squares = load16(s, NORMAL) + load16(s, NORMAL + 2 * LANES) + load16(s, NORMAL + 5 * LANES)
     total = load16(s, TOTAL)
     distance = sqrt16(max16(squares * (ONE / (F1 * F1)) / total, TINY))
-    store16(s, RIDGE, distance * floor * (splat16(FEW) / total + ONE))
+    store16(s, RIDGE, (distance + NARROW) * floor * (splat16(FEW) / total + ONE))
 
 
 @exact_kernel
 def _factorise(k, step, s):
-    """The inverse of the Cholesky factor L of A + ridge, and L⁻¹ b."""
+    """The inverse of the Cholesky factor L of A + ridge, L⁻¹ b, and L⁻¹ of the mean basis values."""
     largest = splat16(ZERO)
     for i in range(k):
         largest = max16(largest, load16(s, NORMAL + (i * (i + 3) // 2) * LANES))
@@ -493,15 +529,17 @@ def _factorise(k, step, s):
         for j in range(i):
             dot = splat16(ZERO)
             for m in range(j, i):
-                dot = fma16(
-                    load16(s, LOW + row + m * LANES), load16(s, INVERSE + (m * (m + 1) // 2 + j) * LANES), dot
-                )
+                dot = fma16(load16(s, LOW + row + m * LANES), load16(s, INVERSE + (m * (m + 1) // 2 + j) * LANES), dot)
             store16(s, INVERSE + row + j * LANES, dot * inverse * -ONE)
         for c in range(0, 3 * LANES, LANES):
             dot = splat16(ZERO)
             for j in range(i + 1):
                 dot = fma16(load16(s, INVERSE + row + j * LANES), load16(s, RIGHT + 3 * j * LANES + c), dot)
             store16(s, PROJECTED + 3 * i * LANES + c, dot)
+        dot = splat16(ZERO)
+        for j in range(0, (i + 1) * LANES, LANES):
+            dot = fma16(load16(s, INVERSE + row + j), load16(s, MOMENT + j), dot)
+        store16(s, MEAN + i * LANES, dot * load16(s, SHARE))
 
 
 @exact_kernel
@@ -513,14 +551,14 @@ def _leave_one_out(count, degree, staged, s):
     for v in range(count):
         at = v * STAGED
         w = load16(staged, at + WEIGHT)
-        r = load16(staged, at + RESIDUAL)
-        g = load16(staged, at + RESIDUAL + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES)
-        squares = splat16(ZERO)
+        r = load16(staged, at + RESIDUAL) - load16(s, OFFSET)
+        g = load16(staged, at + RESIDUAL + LANES) - load16(s, OFFSET + LANES)
+        b = load16(staged, at + RESIDUAL + 2 * LANES) - load16(s, OFFSET + 2 * LANES)
+        squares = load16(s, SHARE)
         p, q, i = INVERSE, PROJECTED, 0
         for d in range(degree):
             for _ in range(2 * d + 3):
-                t = splat16(ZERO)  # (L⁻¹ x)_i: what earlier rows do not explain
+                t = load16(s, MEAN + i * LANES) * -ONE  # becomes (L⁻¹ (x − mean))_i
                 for j in range(0, (i + 1) * LANES, LANES):
                     t = fma16(load16(s, p + j), load16(staged, at + j), t)
                 squares = fma16(t, t, squares)
@@ -566,10 +604,12 @@ def _start_constant(count, choose, staged, s):
     sum_ = splat16(ZERO)
     for v in range(count):
         at = v * STAGED
-        r = load16(staged, at + RESIDUAL)
-        g = load16(staged, at + RESIDUAL + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES)
-        sum_ = fma16(load16(staged, at + WEIGHT), fma16(r, r, fma16(g, g, b * b)), sum_)
+        r = load16(staged, at + RESIDUAL) - load16(s, OFFSET)
+        g = load16(staged, at + RESIDUAL + LANES) - load16(s, OFFSET + LANES)
+        b = load16(staged, at + RESIDUAL + 2 * LANES) - load16(s, OFFSET + 2 * LANES)
+        w = load16(staged, at + WEIGHT)
+        left = max16(splat16(ONE) - w * load16(s, SHARE), LEAST_LEFT)
+        sum_ = fma16(w, fma16(r, r, fma16(g, g, b * b)) / (left * left), sum_)
     error = sum_ / load16(s, TOTAL)
     store16(s, FOUND, error)
     store16(s, BEST, error * (ONE / GAIN) if choose else splat16(HUGE))
@@ -583,8 +623,8 @@ def _start_constant(count, choose, staged, s):
 def _rank_test(s):
     """No candidate can win where the directions, seen along ω_0, lie in a point or on a line.
 
-    A's first three rows are the scatter of ω − ω_0. Seen along ω_0, it has one eigenvalue 0, the sum of the others in
-    its trace and their product in its principal minors.
+    A's first three rows are the scatter of ω about ω_0 (about their mean if there is an offset). Seen along ω_0, it
+    has one eigenvalue 0, the sum of the others in its trace and their product in its principal minors.
     """
     a, b, c = load16(s, TOWARDS + LANES) * -ONE, load16(s, TOWARDS + 2 * LANES), load16(s, TOWARDS) * -ONE
     aa, ab, bb = load16(s, NORMAL), load16(s, NORMAL + LANES), load16(s, NORMAL + 2 * LANES)
@@ -598,7 +638,8 @@ def _rank_test(s):
     cc, bc = cc - c * r * TWO + c * c * along, bc - b * r - c * q + b * c * along
     trace = aa + bb + cc
     minors = aa * bb - ab * ab + aa * cc - ac * ac + bb * cc - bc * bc
-    store16(s, BEST, where_greater(minors, trace * trace * COLLINEAR, load16(s, BEST), splat16(-ONE)))
+    best = where_greater(minors, trace * trace * COLLINEAR, load16(s, BEST), splat16(-ONE))
+    store16(s, BEST, where_greater(trace, load16(s, TOTAL) * SAME, best, splat16(-ONE)))
 
 
 @exact_kernel
