@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-harmonics extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -37,6 +37,10 @@ bench: bench-raster
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
 	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
+
+# with DATA, also what the fit brings to removals: ten minutes more
+bench-harmonics: $(READY)
+	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

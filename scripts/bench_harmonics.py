@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -135,6 +136,7 @@ def torch_methods(
     anchors: np.ndarray, references: np.ndarray, observed: Observations, degree: int, threads: int
 ) -> dict[str, Any]:
     """The fixed fit by batched tensors, basis and weights included."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # or threads that wait on a busy machine count as work
     try:
         import torch
     except ImportError:
@@ -231,9 +233,9 @@ def accuracy(plan: Plan) -> Iterator[dict[str, Any]]:
 def stability(plan: Plan) -> Iterator[dict[str, Any]]:
     """Error curves: RMSE inside the cone, and the 99th percentile of errors all round."""
     cases: dict[str, dict[float, dict[str, Any]]] = {
-        "wrong observations": {x: {"wrong": x} for x in (0.0, 0.05, 0.1, 0.2, 0.3, 0.4)},
-        "exposure jumps": {x: {"jump": 1 + x} for x in (0.0, 0.05, 0.1, 0.2, 0.35, 0.5)},
-        "reference lit otherwise": {x: {"exposure": 1 - x} for x in (0.0, 0.05, 0.1, 0.2, 0.3, 0.5)},
+        "wrong observations": {x: {"wrong": x} for x in (0.0, 0.1, 0.2, 0.3, 0.4)},
+        "exposure jumps": {x: {"jump": 1 + x} for x in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)},
+        "reference lit otherwise": {x: {"exposure": 1 - x} for x in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)},
         "views": {x: {"views": x} for x in (1, 2, 3, 5, 10, 20, 40)},
         "clustered views": {
             x: {"views": 10, "half_angle": math.radians(x), "away": math.radians(45)} for x in (0.1, 0.3, 1, 3, 10, 30)

@@ -353,11 +353,13 @@ def _fit_groups(
             ranks[i] = s[RANK + lane]
             errors[i] = math.sqrt(s[FOUND + lane])
             if s[TOTAL + lane] <= TINY:
-                reasons[i] = 3
+                reasons[i] = Reason.UNOBSERVED
             elif s[CHOSEN + lane] > ZERO:
-                reasons[i] = 0
+                reasons[i] = Reason.VIEW_DEPENDENT
+            elif s[BEST + lane] < ZERO:
+                reasons[i] = Reason.ONE_DIRECTION
             else:
-                reasons[i] = 2 if s[BEST + lane] < ZERO else 1
+                reasons[i] = Reason.CONSTANT
 
 
 @exact_kernel
