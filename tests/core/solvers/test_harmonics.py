@@ -248,6 +248,8 @@ def ill_posed(case: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     aside = np.cross(towards, [[0.0, 0, 1]]) / np.linalg.norm(np.cross(towards, [[0.0, 0, 1]]))
     angles = {"duplicate": np.full(8, 0.5), "reference itself": np.zeros(8)}.get(case, np.linspace(-0.6, 0.9, 8))
     seen = np.cos(angles)[:, None] * towards + np.sin(angles)[:, None] * aside
+    if case == "within 0.1°":
+        seen = near(towards, 8, 1e-3)[0]
     weights = np.ones(8)
     if case == "one view":
         weights[1:] = 0
@@ -274,6 +276,7 @@ def ill_posed(case: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         ("duplicate", Reason.ONE_DIRECTION),
         ("reference itself", Reason.ONE_DIRECTION),
         ("collinear", Reason.ONE_DIRECTION),
+        ("within 0.1°", Reason.ONE_DIRECTION),
     ],
 )
 def test_ill_posed_observations_leave_the_reference_colour_alone(
