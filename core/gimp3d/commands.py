@@ -18,8 +18,9 @@ from .box import read_region
 from .camera import Camera
 from .errors import BadInput
 from .io.cameras import read_cameras, write_transforms
+from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
-from .io.ply import SplatFile, read_ply, write_gaussians, write_ply
+from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
 from .orbit import orbit_cameras
@@ -36,7 +37,7 @@ PASSES = ("rgb", "alpha", "depth", "normal")
 
 def scene_info(path: Path) -> dict[str, Any]:
     """Facts about a scene file: kind, count, SH degree, extent, unusable rows."""
-    file = read_ply(path)
+    file = read_scene(path)
     g = file.gaussians
     usable = g.usable
     means = g.means[usable] if usable.any() else np.zeros((1, 3), np.float32)
@@ -56,10 +57,10 @@ def scene_info(path: Path) -> dict[str, Any]:
 
 
 def convert(source: Path, target: Path) -> None:
-    """Write a scene as a plain binary PLY in Inria's layout."""
+    """Write a scene of any kind that `read_scene` knows as a plain binary PLY in Inria's layout."""
     if target.suffix.lower() != ".ply":
         raise BadInput(f"convert: {target} must end in .ply")
-    write_gaussians(target, read_ply(source).gaussians)
+    write_gaussians(target, read_scene(source).gaussians)
 
 
 def select_cameras(
@@ -105,7 +106,7 @@ def render_views(
         raise BadInput(f"render: --scale must be in (0, 16], got {scale}")
     if not all(0 <= b <= 1 for b in background):
         raise BadInput("render: --background takes three numbers from 0 to 1")
-    gaussians = read_ply(scene).gaussians
+    gaussians = read_scene(scene).gaussians
     chosen = select_cameras(read_cameras(cameras), split, frames)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
@@ -136,7 +137,7 @@ def write_masks(
 ) -> None:
     """Write every view's target region as a 0/255 picture (CONTRACT: masks)."""
     _use_threads(threads)
-    gaussians, region = read_ply(scene).gaussians, read_region(roi)
+    gaussians, region = read_scene(scene).gaussians, read_region(roi)
     available = read_cameras(cameras)
     written = [undistorted(c) for c in select_cameras(available, split, frames)]
     names = {c.id for c in written}
@@ -161,7 +162,7 @@ def write_orbit(
     fov_degrees: float = 50.0,
 ) -> None:
     """Write cameras round a region, for a scene that has none (CONTRACT: orbit)."""
-    read_ply(scene)  # a wrong file should be refused now, not when the cameras are used
+    read_scene(scene)  # a wrong file should be refused now, not when the cameras are used
     cameras = orbit_cameras(read_region(roi), views, tuple(up), width, height, fov_degrees)  # type: ignore[arg-type]
     write_transforms(out, cameras)
 
@@ -179,7 +180,7 @@ def run_removal(
     if out.suffix.lower() != ".ply":
         raise BadInput(f"--out: {out} must end in .ply")
     progress("read", 0, 1, job.scene)
-    file = read_ply(Path(job.scene))
+    file = read_scene(Path(job.scene))
     region = read_region(Path(job.roi))
     cameras = _removal_cameras(job)
     warnings = list(_scene_warnings(file))
