@@ -265,8 +265,8 @@ def scenes(data: Path, out: Path) -> list[dict[str, Any]]:
         "degree 1, ridge 1": (1, HarmonicsSettings(ridge=1.0)),
         "floor 0.2": (2, HarmonicsSettings()),
         "floor 20": (2, HarmonicsSettings(floor=20.0)),
-        "floor 20, trust 0": (2, HarmonicsSettings(floor=20.0, trust=0.0)),
-        "floor 6, trust 0": (2, HarmonicsSettings(floor=6.0, trust=0.0)),
+        "floor 20, offset": (2, HarmonicsSettings(floor=20.0, offset=True)),
+        "floor 6, offset": (2, HarmonicsSettings(floor=6.0, offset=True)),
     }
     variants = {
         name: replace(balanced.seed, sh_degree=degree, harmonics=settings) for name, (degree, settings) in asked.items()

@@ -128,8 +128,8 @@ def gimp3d(s: Simulation, settings: HarmonicsSettings = HarmonicsSettings()) -> 
     return fit_harmonics(grey(s.anchors), s.anchor_directions, observations(s), 3, settings).sh[:, 1:, 0]
 
 
-def wary(s: Simulation) -> np.ndarray:
-    return gimp3d(s, HarmonicsSettings(trust=0.0))
+def with_offset(s: Simulation) -> np.ndarray:
+    return gimp3d(s, HarmonicsSettings(offset=True))
 
 
 RULES: dict[str, Rule] = {
@@ -138,7 +138,7 @@ RULES: dict[str, Rule] = {
     "ridge 1, degree 3": ridge,
     "leave-one-out": leave_one_out,
     "gimp3d": gimp3d,
-    "gimp3d, trust 0": wary,
+    "gimp3d, offset": with_offset,
 }
 
 

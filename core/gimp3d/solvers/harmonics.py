@@ -48,7 +48,7 @@ LEAST_LEFT = np.float32(1e-3)  # of 1 − leverage
 HALVINGS = 20  # of the interval that holds a median
 MAD = 1.4826  # median absolute deviation → standard deviation
 LEAST_SIGMA = 1.0 / 255  # of 8-bit colours
-SAMPLE = 1 << 16  # observations that suffice for σ_0
+SAMPLE = 1 << 14  # observations that suffice for σ_0: its error is about 1 %
 
 LANES = 16
 K = 15  # coefficients above degree 0
@@ -84,7 +84,7 @@ class HarmonicsSettings:
     """How strongly the colours of few directions are held to the reference's colour."""
 
     floor: float = 0.2  # of the ridge, in observations, for a cone of directions of about 60° (see fit_harmonics)
-    trust: float = math.inf  # in observations, that the views' colours are not all off by as much; 0: they may well be
+    offset: bool = False  # fit along, and leave out, what all views are off by against the reference
     ridge: float | None = None  # this ridge and the highest degree for all, the paper's weights: nothing is chosen
 
 
@@ -213,8 +213,8 @@ def fit_harmonics(
     unit vectors ω from ω_0.
 
     Where the reference is lit otherwise than the views (another exposure, a shadow that is gone), every residual
-    holds the same offset, and a fit through c_0 would bend the colour towards it. With a finite `trust`, a common
-    offset is fitted along, with `trust` as its ridge, and left out of the result.
+    holds the same offset, and a fit through c_0 would bend the colour towards it. With `offset`, it is fitted along
+    (eliminated from the normal equations) and left out of the result. That costs accuracy where c_0 is right.
 
     Degree 0, c_0 alone, for Gaussians without observations and where the directions, seen from ω_0, do not span a
     patch of the sphere (rank test: one view, duplicates, a line).
@@ -262,7 +262,7 @@ def fit_harmonics(
         degree,
         np.float32(sigma),
         np.float32(settings.floor),
-        np.float32(settings.trust),
+        settings.offset,
         np.float32(-1 if settings.ridge is None else settings.ridge),
         fit.sh,
         fit.degree,
@@ -301,7 +301,7 @@ def _fit_groups(
     degree,
     sigma,
     floor,
-    trust,
+    offset,
     ridge,  # < 0: chosen per Gaussian
     sh,
     degrees,
@@ -318,13 +318,13 @@ def _fit_groups(
         rows = order[group * LANES : (group + 1) * LANES]
         count = _stage(rows, offsets, directions, colours, weights, anchors, anchor_directions, staged, s)
         _expand(count, degree, sigma, staged, s)
-        _normal_equations(count, k, trust, staged, s)
+        _normal_equations(count, k, offset, staged, s)
         if ridge < ZERO and degree > 0:
             _set_ridge(FIRST_STEP * floor, s)
             _factorise(k, ONE, s)
             _leave_one_out(count, degree, staged, s)
             _reweigh(count, sigma, staged, s)
-            _normal_equations(count, k, trust, staged, s)
+            _normal_equations(count, k, offset, staged, s)
         _start_constant(count, ridge < ZERO, staged, s)
         if degree > 0:
             _rank_test(s)
@@ -450,8 +450,8 @@ def _basis(degree, source, start, out, at):
 
 
 @exact_kernel
-def _normal_equations(count, k, trust, staged, s):
-    """A = Σ w x xᵀ (packed rows), b = Σ w x rᵀ, Σ w, with the views' common offset eliminated."""
+def _normal_equations(count, k, offset, staged, s):
+    """A = Σ w x xᵀ (packed rows), b = Σ w x rᵀ, Σ w, with the views' common offset, if any, eliminated."""
     for p in range(NORMAL, LOW, LANES):
         store16(s, p, splat16(ZERO))
     for p in range(MOMENT, MOMENT + K * LANES, LANES):
@@ -477,7 +477,7 @@ def _normal_equations(count, k, trust, staged, s):
             q += 3 * LANES
             m += LANES
     total = max16(total, TINY)
-    share = splat16(ONE) / (total + trust)
+    share = splat16(ONE if offset else ZERO) / total
     red, green, blue = red * share, green * share, blue * share
     store16(s, TOTAL, total)
     store16(s, SHARE, share)

@@ -27,7 +27,7 @@ class SeedSettings:
     sh_degree: int = 2  # the highest of new Gaussians; each gets the one that its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
-    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, trust=0.0)
+    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
     depth_tolerance: float = 0.02  # z-test of observations
 
 
