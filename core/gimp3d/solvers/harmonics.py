@@ -276,8 +276,10 @@ def fit_harmonics(
 def _sigma_of(
     anchors: np.ndarray, offsets: np.ndarray, directions: np.ndarray, colours: np.ndarray, weights: np.ndarray
 ) -> float:
-    """σ_0: the robust size of all residuals, from evenly spaced ones if there are very many."""
-    rows = np.arange(0, len(weights), max(1, len(weights) // SAMPLE))
+    """σ_0: the robust size of all residuals, from random ones if there are very many."""
+    rows = np.arange(len(weights))
+    if len(rows) > SAMPLE:  # evenly spaced ones may all be of one view
+        rows = np.random.default_rng(0).integers(0, len(weights), SAMPLE)
     finite = np.isfinite(weights[rows]) & np.isfinite(directions[rows]).all(1) & np.isfinite(colours[rows]).all(1)
     rows = rows[finite & (weights[rows] > 0)]
     if len(rows) == 0:

@@ -406,6 +406,17 @@ def test_results_depend_neither_on_threads_nor_on_neighbours() -> None:
     np.testing.assert_array_equal(moved.sh, fits[0].sh[order])
 
 
+@pytest.mark.parametrize("views", [8, 10, 16])
+def test_sigma_is_that_of_all_views(views: int) -> None:
+    """Every Gaussian's first observation is the reference itself."""
+    count = 80_000 // views
+    colours = 0.5 + np.random.default_rng(0).normal(0, 0.05, (count, views, 3))
+    colours[:, 0] = 0.5
+    towards = directions(count)
+    fit = fit_harmonics(np.full((count, 3), 0.5), towards, dense(near(towards, views, 0.3), colours), 0)
+    assert fit.sigma == pytest.approx(1.4826 * np.median(np.linalg.norm(colours - 0.5, axis=-1)), rel=0.05)
+
+
 def test_observations_of_several_views_are_sorted_by_gaussian() -> None:
     rng = np.random.default_rng(4)
     rows = [rng.permutation(9)[: rng.integers(0, 9)] for _ in range(6)]
