@@ -41,7 +41,7 @@ from .selection import (
     without_revealed,
 )
 from .surroundings import follow_surroundings
-from .visibility import Sight, depth_agreement
+from .visibility import SHOWN, UNSEEN, Sight, depth_agreement
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -156,7 +156,7 @@ def find_masks(
     if warnings or mode == "paper":
         mode = "paper"
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
-    views = tuple(_view_masks(b, a, n, mode, settings) for b, a, n in zip(before, after, needed))
+    views = tuple(_view_masks(b, a, n, settings) for b, a, n in zip(before, after, needed))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
@@ -309,15 +309,24 @@ def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.nda
 
 
 def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1)."""
+    """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1).
+
+    Parts thinner than 3 px are mostly edges, where a pixel's depth is of neither side, or surface that views place a
+    little differently. They count only where that is excluded: no view sees past what appears there, none shows it
+    within twice the tolerance, and no void borders on it.
+    """
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
     window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
     rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
     evidence = touched & (after.alpha < settings.void)
-    evidence[rows, cols] = sight.shows(points, settings.depth_tolerance)
+    evidence[rows, cols] = sight.of(points, settings.depth_tolerance) == SHOWN
     evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
-    return touched & ~evidence
+    certain = after.weight > settings.hides
+    certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == UNSEEN
+    void = (evidence & ~solid).astype(np.uint8)
+    certain &= solid | (cv2.dilate(void, np.ones((5, 5), np.uint8)) == 0)
+    return _tidy(touched & ~evidence, certain, touched, settings.margin)
 
 
 def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: _Before, settings: MaskSettings) -> np.ndarray:
@@ -332,11 +341,10 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
     return np.any([fill_polygon(p, view.camera.width, view.camera.height) for p in view.polygons], axis=0)
 
 
-def _view_masks(before: _Before, after: _After, needed: np.ndarray, mode: str, settings: MaskSettings) -> ViewMasks:
+def _view_masks(before: _Before, after: _After, needed: np.ndarray, settings: MaskSettings) -> ViewMasks:
     silhouette = after.weight > settings.changed
     occluder = _in_front(before.depth, after.weight > 0.5, settings)
-    target = needed if mode == "paper" else _tidy(needed, silhouette, settings.margin)
-    target, depth = target & ~occluder, before.depth
+    target, depth = needed & ~occluder, before.depth
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(
@@ -399,11 +407,17 @@ def sees(
     return result
 
 
-def _tidy(target: np.ndarray, allowed: np.ndarray, margin: int) -> np.ndarray:
-    """Close pinholes, drop single pixels, and grow by a margin within what the object touched."""
+def _tidy(
+    target: np.ndarray,  # [H, W] bool
+    certain: np.ndarray,  # [H, W] bool, where thin parts are no noise
+    allowed: np.ndarray,  # [H, W] bool, what the object touched
+    margin: int,
+) -> np.ndarray:
+    """Close pinholes, drop thin parts that are not certain, and grow by a margin within what the object touched."""
     kernel = np.ones((3, 3), np.uint8)
     solid = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    if margin:
-        solid = cv2.dilate(solid, kernel, iterations=margin)
-    return (solid > 0) & cv2.dilate(allowed.astype(np.uint8), kernel).astype(bool)
+    grown = cv2.dilate(solid, kernel, iterations=margin)
+    thin = target & certain & (grown == 0)
+    grown |= cv2.dilate(thin.astype(np.uint8), kernel, iterations=margin)
+    return (grown > 0) & cv2.dilate(allowed.astype(np.uint8), kernel).astype(bool)

@@ -16,6 +16,7 @@ from ..threads import parallel_map, run_ranges
 from .outline import Window, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
+UNSEEN, SEEN_PAST, SHOWN = 0, 1, 2  # what the views together say of a point
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,14 @@ class Sight:
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
 
-    def shows(
+    def of(
         self,
         points: np.ndarray,  # [N, 3] scene coordinates
         tolerance: float,  # relative z
     ) -> np.ndarray:
-        """[N] bool: the point is the first surface of some view, which is not hidden there."""
-        found = np.zeros(len(points), bool)
+        """[N] uint8: SHOWN if the point is the first surface of some view, which is not hidden there; SEEN_PAST if it
+        is not, and some view sees a surface behind it; else UNSEEN."""
+        found = np.zeros(len(points), np.uint8)
         arrays = np.ascontiguousarray(points, np.float64), self.cameras, self.starts, self.limits
         run_ranges(_find_view, len(points), *arrays, float(tolerance), found)
         return found
@@ -92,7 +94,7 @@ def _spread_order(count: int) -> list[int]:
 
 @exact_kernel
 def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
-    """found[i] for i in [lo, hi): views are asked in turn until one sees the point."""
+    """found[i] for i in [lo, hi): views are asked in turn until one shows the point."""
     for i in range(lo, hi):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for v in range(len(cameras)):
@@ -106,5 +108,7 @@ def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
                 continue
             limit = limits[starts[v] + int(row) * int(c[16]) + int(col)]
             if abs(depth - limit) <= tolerance * depth:
-                found[i] = True
+                found[i] = SHOWN
                 break
+            if limit > depth:
+                found[i] = SEEN_PAST
