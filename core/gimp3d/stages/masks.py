@@ -61,7 +61,7 @@ class MaskSettings:
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
-    occluder_step: float = 0.06  # how much nearer (relative) a kept surface counts as in front
+    occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
@@ -156,7 +156,7 @@ def find_masks(
     if warnings or mode == "paper":
         mode = "paper"
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
-    views = tuple(_view_masks(b, a, n, settings) for b, a, n in zip(before, after, needed))
+    views = tuple(_view_masks(b, a, n, not warnings, settings) for b, a, n in zip(before, after, needed))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
@@ -311,9 +311,10 @@ def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.nda
 def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1).
 
-    Parts thinner than 3 px are mostly edges, where a pixel's depth is of neither side, or surface that views place a
-    little differently. They count only where that is excluded: no view sees past what appears there, none shows it
-    within twice the tolerance, and no void borders on it.
+    Half covered pixels at a void that counts as seen are the edge of what stands before it, as splats blur it. Parts
+    thinner than 3 px are mostly depth edges, where a pixel's depth is of neither side, or surface that views place a
+    little differently. They count only where that is excluded: no view sees past what appears there, nor does one show
+    it within twice the tolerance.
     """
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
@@ -321,11 +322,13 @@ def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings)
     rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
     evidence = touched & (after.alpha < settings.void)
     evidence[rows, cols] = sight.of(points, settings.depth_tolerance) == SHOWN
-    evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
+    continues = np.zeros_like(touched)
+    continues[window] = _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
+    evidence &= continues
+    void = (continues & (after.alpha < settings.void)).astype(np.uint8)
+    evidence |= touched & ~solid & (cv2.dilate(void, np.ones((7, 7), np.uint8)) > 0)
     certain = after.weight > settings.hides
     certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == UNSEEN
-    void = (evidence & ~solid).astype(np.uint8)
-    certain &= solid | (cv2.dilate(void, np.ones((5, 5), np.uint8)) == 0)
     return _tidy(touched & ~evidence, certain, touched, settings.margin)
 
 
@@ -341,10 +344,13 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
     return np.any([fill_polygon(p, view.camera.width, view.camera.height) for p in view.polygons], axis=0)
 
 
-def _view_masks(before: _Before, after: _After, needed: np.ndarray, settings: MaskSettings) -> ViewMasks:
+def _view_masks(
+    before: _Before, after: _After, needed: np.ndarray, consistent: bool, settings: MaskSettings
+) -> ViewMasks:
     silhouette = after.weight > settings.changed
-    occluder = _in_front(before.depth, after.weight > 0.5, settings)
-    target, depth = needed & ~occluder, before.depth
+    occluder = _in_front(before.depth, after.weight > 0.5, settings) & consistent  # else depths say nothing
+    beside = cv2.dilate(occluder.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # there T must not outgrow the object
+    target, depth = needed & ~occluder & (silhouette | ~beside), before.depth
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(
@@ -353,14 +359,22 @@ def _view_masks(before: _Before, after: _After, needed: np.ndarray, settings: Ma
 
 
 def _in_front(depth: np.ndarray, object_: np.ndarray, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: pixels at the object's outline whose first surface lies clearly in front of it, and their rim."""
-    size = 2 * settings.margin + 1
-    object_depth = np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32)
-    nearest = cv2.erode(
-        object_depth, np.ones((size, size)), borderType=cv2.BORDER_REPLICATE
-    )  # its own border is finite
-    front = ~object_ & (depth > 0) & (depth < (1 - settings.occluder_step) * np.where(np.isfinite(nearest), nearest, 0))
-    return cv2.dilate(front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    """[H, W] bool: surface at the object's outline behind whose continuation the object lies, and a pixel round it.
+
+    The continuation is a plane in disparity, level where the surface falls off on its other side. The floor before the
+    object's foot rises to it and is not in front, however flat the view; a thin rod is, close as it may stand.
+    """
+    reach = max(1, settings.margin)
+    disparity = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    padded = np.pad(disparity, reach, "reflect", reflect_type="odd")  # slopes go on beyond the frame
+    there = np.pad(object_ & (depth > 0), reach)
+    (h, w), front = depth.shape, np.zeros_like(object_)
+    for dy, dx in ((dy, dx) for dy in (-reach, 0, reach) for dx in (-reach, 0, reach) if dy or dx):
+        ahead = np.s_[reach + dy : reach + dy + h, reach + dx : reach + dx + w]
+        behind = np.s_[reach - dy : reach - dy + h, reach - dx : reach - dx + w]
+        continued = np.minimum(disparity, 2 * disparity - padded[behind])
+        front |= there[ahead] & (padded[ahead] < (1 - settings.occluder_step) * continued)
+    return cv2.dilate((front & ~object_).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _continues_outside(
