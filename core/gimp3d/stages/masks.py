@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..box import Region
+from ..box import Region, in_region
 from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
@@ -29,13 +29,17 @@ from .outline import (
     window_round,
 )
 from .selection import (
+    Fate,
     Selection,
     SelectionSettings,
     Sighting,
+    boxes_of,
     by_centre,
     object_and_rim,
     select,
     select_removed,
+    standing,
+    surface_in,
     weigh,
     weigh_revealed,
     without_revealed,
@@ -147,7 +151,7 @@ def find_masks(
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
     selection = by_centre(inside)
     if not settings.selection.by_centre:
-        selection = _choose(gaussians, region, before, passes, settings.selection)
+        selection, before = _choose(gaussians, region, before, passes, settings.selection)
     kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
     sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)])
@@ -262,27 +266,44 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 def _choose(
     gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
-) -> Selection:
-    """Which Gaussians go, by what the views show of them."""
+) -> tuple[Selection, list[_Before]]:
+    """Which Gaussians go, by what the views show of them; and the views, with what else the user named masked out.
+
+    Where nothing stands out of the surface in a box, the surface itself is meant: a shadow, a picture on the floor.
+    """
     depths = [(b.camera, b.depth) for b in before]
     surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
+    centre = by_centre(select_removed(gaussians, region))
+    if all(box.size.max() < settings.least_cells * s.cell for box, s in zip(region, surroundings)):
+        return centre, list(before)  # pictures this small show no surface to follow
+    seen = passes.over(lambda b: object_and_rim(b.camera, b.depth, region, surroundings, settings), before)
+    members = [boxes_of(b.camera, np.where(o, b.depth, 0), region, surroundings) for b, (o, _) in zip(before, seen)]
+    stands = standing(members, [int(_polygon_pixels(b).sum()) for b in before], settings.least_object)
+    objects = tuple(box for box, s in zip(region, stands) if s)
+    named = tuple(box for box, s in zip(region, stands) if not s)
 
-    def sighting(view: _Before) -> Sighting:
-        object_, ring = object_and_rim(view.camera, view.depth, region, surroundings, settings)
+    def with_named(view: _Before) -> _Before:
+        mask = surface_in(view.camera, view.depth, named) & ~surface_in(view.camera, view.depth, objects)
+        return replace(view, extra=mask if view.extra is None else mask | view.extra)
+
+    views = parallel_map(with_named, before) if named else list(before)
+    if not objects:
+        return centre, views
+
+    def sighting(view: _Before, object_: np.ndarray, ring: np.ndarray) -> Sighting:
         clear = view.agrees & ~object_ & ~ring
         if view.extra is not None:
             object_, clear = object_ & ~view.extra, clear & ~view.extra
         return Sighting(view.camera, object_, clear, view.extra)
 
-    sightings = passes.over(sighting, before)
-    if not any(s.object_.sum() > settings.least_object * _polygon_pixels(b).sum() for s, b in zip(sightings, before)):
-        return by_centre(select_removed(gaussians, region))  # nothing stands out: the surface itself is meant
+    sightings = [sighting(v, *s) for v, s in zip(views, seen)]
     weights = weigh(gaussians, sightings)
-    selection = select(gaussians, region, weights, surroundings, settings)
-    if settings.support == 0:
-        return selection
-    revealed = weigh_revealed(gaussians, selection, sightings)
-    return without_revealed(gaussians, selection, region, weights.clear, revealed, settings)
+    selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o], settings)
+    if settings.support > 0:
+        revealed = weigh_revealed(gaussians, selection, sightings)
+        selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, settings)
+    alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
+    return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), selection.fates)), views
 
 
 def _without(
