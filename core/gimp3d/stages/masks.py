@@ -66,6 +66,7 @@ class MaskSettings:
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
     occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
+    infinity: float = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
@@ -154,8 +155,9 @@ def find_masks(
         selection, before = _choose(gaussians, region, before, passes, settings.selection)
     kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
-    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)])
-    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, settings), range(len(after)))
+    centre = np.mean([box.center for box in region], axis=0)
+    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)], centre)
+    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, centre, settings), range(len(after)))
     mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
     if warnings or mode == "paper":
         mode = "paper"
@@ -329,22 +331,26 @@ def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.nda
     return hidden if before.extra is None else hidden | before.extra
 
 
-def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
+def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1).
 
-    Half covered pixels at a void that counts as seen are the edge of what stands before it, as splats blur it. Parts
-    thinner than 3 px are mostly depth edges, where a pixel's depth is of neither side, or surface that views place a
-    little differently. They count only where that is excluded: no view sees past what appears there, nor does one show
-    it within twice the tolerance.
+    A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
+    seen are the edge of what stands before it, as splats blur it. Parts thinner than 3 px are mostly depth edges, where
+    a pixel's depth is of neither side, or surface that views place a little differently. They count only where that is
+    excluded: no view sees past what appears there, nor does one show it within twice the tolerance.
     """
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
     window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
     rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
     evidence = touched & (after.alpha < settings.void)
-    evidence[rows, cols] = sight.of(points, settings.depth_tolerance) == SHOWN
+    distance = float(np.linalg.norm(camera.centre - centre))
+    shown = sight.of(points, settings.depth_tolerance) == SHOWN
+    evidence[rows, cols] = shown | (after.depth[rows, cols] > settings.infinity * distance)
     continues = np.zeros_like(touched)
-    continues[window] = _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
+    continues[window] = _continues_outside(
+        after.depth[window], after.alpha[window], touched[window], distance, settings
+    )
     evidence &= continues
     void = (continues & (after.alpha < settings.void)).astype(np.uint8)
     evidence |= touched & ~solid & (cv2.dilate(void, np.ones((7, 7), np.uint8)) > 0)
@@ -402,6 +408,7 @@ def _continues_outside(
     depth: np.ndarray,  # [H, W] z without the object, 0 = nothing
     alpha: np.ndarray,  # [H, W]
     touched: np.ndarray,  # [H, W] bool, by the object
+    distance: float,  # of the object, beyond which steps are of disparity, as for Sight
     settings: MaskSettings,
 ) -> np.ndarray:
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
@@ -414,7 +421,8 @@ def _continues_outside(
     index = np.arange(z.size).reshape(z.shape)
     pairs = []
     for near, far in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        close = np.abs(z[near] - z[far]) < settings.layer_step * np.minimum(z[near], z[far])
+        low, high = np.minimum(z[near], z[far]), np.maximum(z[near], z[far])
+        close = high - low < settings.layer_step * low * np.maximum(1, high / distance)
         same = there[near] & there[far] & np.where(void[near], void[far], close & ~void[far])
         pairs.append(np.stack([index[near][same], index[far][same]]))
     a, b = np.concatenate(pairs, axis=1)
