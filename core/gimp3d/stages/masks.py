@@ -45,7 +45,7 @@ from .selection import (
     without_revealed,
 )
 from .surroundings import follow_surroundings
-from .visibility import SHOWN, UNSEEN, Sight, depth_agreement
+from .visibility import HIDES, SHOWN, Sight, depth_agreement
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -337,7 +337,8 @@ def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, set
     A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
     seen are the edge of what stands before it, as splats blur it. Parts thinner than 3 px are mostly depth edges, where
     a pixel's depth is of neither side, or surface that views place a little differently. They count only where that is
-    excluded: no view sees past what appears there, nor does one show it within twice the tolerance.
+    excluded: no view sees past what appears there or shows it within twice the tolerance, and the object hides it from
+    more views than other surfaces do.
     """
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
@@ -355,7 +356,7 @@ def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, set
     void = (continues & (after.alpha < settings.void)).astype(np.uint8)
     evidence |= touched & ~solid & (cv2.dilate(void, np.ones((7, 7), np.uint8)) > 0)
     certain = after.weight > settings.hides
-    certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == UNSEEN
+    certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == HIDES
     return _tidy(touched & ~evidence, certain, touched, settings.margin)
 
 

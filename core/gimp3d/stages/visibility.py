@@ -16,7 +16,7 @@ from ..threads import parallel_map, run_ranges
 from .outline import Window, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
-UNSEEN, SEEN_PAST, SHOWN = 0, 1, 2  # what the views together say of a point
+HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class Sight:
         tolerance: float,  # relative z, up to the centre's distance; beyond it, of disparity times that distance
     ) -> np.ndarray:
         """[N] uint8: SHOWN if the point is the first surface of some view, which is not hidden there; SEEN_PAST if it
-        is not, and some view sees a surface behind it; else UNSEEN.
+        is not, and some view sees a surface behind it; BURIED if it lies behind surfaces in most views, so that it is
+        on none; else HIDES: the object alone hides it.
 
         What is far away moves little between views, so depths there are little certain, and need not be: a sky's splats
         lie anywhere. A difference of disparity shifts pixels by the same amount at every distance.
@@ -106,6 +107,7 @@ def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
     """found[i] for i in [lo, hi): views are asked in turn until one shows the point."""
     for i in range(lo, hi):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        hidden = 0  # views in which the object hides the point, less those in which a surface does
         for v in range(len(cameras)):
             c = cameras[v]
             depth = c[6] * x + c[7] * y + c[8] * z + c[11]
@@ -121,3 +123,6 @@ def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
                 break
             if limit > depth:
                 found[i] = SEEN_PAST
+            hidden += 1 if limit == HIDDEN else -1
+        if found[i] == HIDES and hidden < 0:
+            found[i] = BURIED

@@ -11,7 +11,7 @@ from gimp3d.camera import Camera
 from gimp3d.raster import surface_depth
 from gimp3d.stages.masks import sees
 from gimp3d.stages.outline import surface_points
-from gimp3d.stages.visibility import SEEN_PAST, SHOWN, UNSEEN, Sight, depth_agreement
+from gimp3d.stages.visibility import BURIED, HIDES, SEEN_PAST, SHOWN, Sight, depth_agreement
 from gimp3d.threads import set_thread_count
 
 CAMERAS = [c.scaled(f) for c, f in zip(cameras(), (1, 0.5, 1.3, 0.77, 1, 1, 1, 1, 1))]
@@ -35,7 +35,14 @@ def test_a_point_is_shown_or_seen_past_by_a_view_that_is_not_hidden(seed: int, t
     past = np.any([sees_past(c, d, points) for c, d in open_], axis=0)
     found = Sight.make(list(zip(CAMERAS, DEPTHS, hidden)), FAR).of(points, tolerance)
     assert ((found == SHOWN) == shown).all()
-    assert ((found == SEEN_PAST) == past & ~shown).all() and len(np.unique(found)) == 3
+    assert ((found == SEEN_PAST) == past & ~shown).all() and len(np.unique(found)) == 4
+
+
+def test_what_lies_behind_surfaces_in_most_views_is_buried() -> None:
+    inside = np.array([[0, 0, 0.2]])
+    for count in range(len(CAMERAS) + 1):  # views in which the object hides it; in the others it is a surface
+        views = [(c, d, np.full(d.shape, k < count)) for k, (c, d) in enumerate(zip(CAMERAS, DEPTHS))]
+        assert Sight.make(views, FAR).of(inside, 0.001)[0] == (HIDES if 2 * count >= len(CAMERAS) else BURIED)
 
 
 def sees_past(camera: Camera, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -50,7 +57,7 @@ def test_far_away_disparity_decides() -> None:
     camera, ray = CAMERAS[0], CAMERAS[0].forward
     sky = Sight.make([(camera, np.full((90, 120), 60, np.float32), np.zeros((90, 120), bool))], camera.centre + 3 * ray)
     points = camera.centre + np.array([[50], [70], [100], [30]]) * ray
-    assert (sky.of(points, 0.02) == [SHOWN, SHOWN, UNSEEN, SEEN_PAST]).all()  # 1/50, 1/70 are within 0.02/3 of 1/60
+    assert (sky.of(points, 0.02) == [SHOWN, SHOWN, BURIED, SEEN_PAST]).all()  # 1/50, 1/70 are within 0.02/3 of 1/60
 
 
 def test_the_answer_does_not_depend_on_threads_or_on_the_order_of_views() -> None:
