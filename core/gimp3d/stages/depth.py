@@ -193,10 +193,7 @@ def _as_far_as_believed(
     alone = replace(around, guide=None)
     plan = choose_plan(alone, settings, insist=False)
     ratio = missed / max(withheld_miss(alone, plan, settings, around.rim), 1e-9)
-    # Planes reach across the hole as well as across the band; a plate gets worse with the distance, and a prior does not.
-    planar = any(layer.surface is not None for layer in plan.layers)
-    half = settings.prior_miss / (2 if planar else 1)
-    believed = 1.0 if np.isnan(ratio) else 1 / (1 + (ratio / half) ** 8)
+    believed = 1.0 if np.isnan(ratio) else 1 / (1 + (ratio / settings.prior_miss) ** 8)
     if believed >= 0.99:
         return guided, 1.0
     return believed * guided + (1 - believed) * fill(alone, plan, settings), believed
