@@ -6,7 +6,7 @@ features keep a hole in a detailed texture from being filled with flat patches).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,13 +14,9 @@ from numba import float32
 
 from ..jit import kernel
 from ..threads import run_ranges
-from .patchmatch import (
-    NearestNeighbourField,
-    PatchMatchSettings,
-    patch_centres,
-    refined,
-    upsampled,
-)
+from .patch_index import index_patches
+from .patches import lay_out
+from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
 
 MOST_PEEL_SOURCES = 4096  # patches of the coarsest level that the first guess looks at
 VOTE_ROWS = 8  # rows per piece of work
@@ -39,7 +35,8 @@ class ExemplarSettings:
     sweeps: int = 2  # of PatchMatch per round
     rim_trust: float = 1.3  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
     settled: float = 0.3  # grey levels; a round that changes less ends its level
-    reach: int = 12  # of the random search below the coarsest level
+    grid: int = 2  # spacing of the sources that the tree of patches holds
+    reach: int = 4  # of the random search round the best source
     locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
     seed: int = 0
 
@@ -158,10 +155,11 @@ def _settled(
     allowed = patch_centres(~hole, radius)
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     penalty = np.float32(settings.locality / hole.shape[1]) * away
-    reach = settings.reach if field is not None else 0
+    index = index_patches(lay_out(current, radius), allowed, settings.grid) if allowed.any() else None
+    matching = PatchMatchSettings(coherence=0.0, tree_sweeps=1, sweeps=settings.sweeps, reach=settings.reach)
     for number in range(rounds):
-        matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, draws=2, seed=settings.seed + 31 * number)
-        field = refined(field, current, touching, allowed, radius, matching, penalty, reach)
+        matching = replace(matching, seed=settings.seed + 31 * number)
+        field = refined(field, lay_out(current, radius), touching, allowed, matching, penalty, index)
         sharpness = 1.0 / max(float(np.percentile(field.cost[touching], 75)), 255.0**-2)
         voted = _voted(current, hole, field, settings, sharpness)
         change = 255 * float(np.abs(voted - current)[hole][:, :3].mean())
