@@ -81,16 +81,18 @@ def test_costs_come_near_those_of_exhaustive_search(seed: int, levels: int) -> N
 @pytest.mark.parametrize("patch", [1, 3, 7, 9])
 def test_patches_of_any_size_are_compared(patch: int) -> None:
     image, target = texture(60, 90), disc(60, 90, 10)
-    field = nearest_neighbour_field(image, target, ~target, None, replace(APPEARANCE_ONLY, patch=patch))
+    field = nearest_neighbour_field(image, target, ~target, None, replace(APPEARANCE_ONLY, patch=patch, grid=1))
     least = exhaustive(image, target, patch_centres(~target, patch // 2), np.zeros(target.shape), patch // 2)
     assert field.radius == patch // 2
     assert (field.cost[target] >= least - 1e-6).all()
-    assert field.cost[target].mean() <= 1.08 * least.mean() + 1e-5
+    most = 1.4 if patch == 1 else 1.08  # of single pixels that look alike, the neighbours do not
+    assert field.cost[target].mean() <= most * least.mean()
 
 
 def test_penalties_count_as_much_as_likeness() -> None:
     image, target = texture(72, 96), disc(72, 96, 14)
-    penalty = np.random.default_rng(0).uniform(0, 0.01, target.shape).astype(np.float32)
+    noise = np.random.default_rng(0).uniform(0, 1, target.shape).astype(np.float32)
+    penalty = 0.1 * np.maximum(0, cv2.GaussianBlur(noise, (0, 0), 6) - 0.48)
     field = nearest_neighbour_field(image, target, ~target, penalty, APPEARANCE_ONLY)
     least = exhaustive(image, target, patch_centres(~target, 2), penalty)
     assert (field.cost[target] >= least - 1e-6).all()
