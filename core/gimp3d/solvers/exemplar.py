@@ -10,16 +10,17 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numba import float32
 
 from ..jit import kernel
 from ..threads import run_ranges
+from .greedy import fill_inwards
 from .patch_index import index_patches
-from .patches import lay_out
+from .patches import lay_out, repainting
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
 
-MOST_PEEL_SOURCES = 4096  # patches of the coarsest level that the first guess looks at
-VOTE_ROWS = 8  # rows per piece of work
+VOTE_PIXELS = 1024  # per piece of work
+LEAST_SAY = 1e-12  # of a patch that fits badly
+FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,14 @@ class ExemplarSettings:
     """Lengths in pixels."""
 
     patch: int = 5  # side, odd
-    texture: float = 5.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
+    texture: float = 20.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
+    thickness: float = 8.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
     smallest: int = 24  # no level is smaller
-    coarse_rounds: int = 12  # of matching and voting on the coarsest level
-    fewer_rounds: int = 3  # by which every finer level has fewer
-    fine_rounds: int = 2  # at least
+    coarse_rounds: int = 6  # of matching and voting on the coarsest level
+    fewer_rounds: int = 3  # by which every finer level has fewer, down to one
     sweeps: int = 2  # of PatchMatch per round
-    rim_trust: float = 1.3  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
+    rim_trust: float = 5.0  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
     settled: float = 0.3  # grey levels; a round that changes less ends its level
-    grid: int = 2  # spacing of the sources that the tree of patches holds
     reach: int = 4  # of the random search round the best source
     locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
     seed: int = 0
@@ -55,39 +55,86 @@ def complete_picture(
     settings: ExemplarSettings = ExemplarSettings(),
 ) -> Completion:
     """Fill the hole so that every patch of it resembles one outside."""
+    if not hole.any():
+        return Completion(image.copy(), 0.0)
     radius = settings.patch // 2
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
-    coarse, open_ = levels[-1]
-    current = _peeled(coarse, open_, radius)
+    if levels[-1][1].all():
+        return Completion(image.copy(), float("nan"))
     field: NearestNeighbourField | None = None
-    for number, (known, open_) in enumerate(reversed(levels)):
-        touching = cv2.dilate(open_.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-        if field is not None:
-            size = (open_.shape[1], open_.shape[0])
-            grown = _resized(current, size, cv2.INTER_LINEAR)
-            field = upsampled(field, touching)
-            current = _voted(np.where(open_[..., None], grown, known), open_, field, settings, 0.0)
-        rounds = max(settings.fine_rounds, settings.coarse_rounds - settings.fewer_rounds * number)
-        current, field = _settled(current, open_, touching, field, radius, rounds, settings)
+    for number, (channels, open_) in enumerate(reversed(levels)):
+        rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
+        colours, field = _level(channels, open_, field, radius, rounds, settings)
     assert field is not None
-    filled = np.clip(np.rint(current[..., :3] * 255), 0, 255).astype(np.uint8)
-    return Completion(np.where(hole[..., None], filled, image), _misfit(current, hole, field))
+    filled = image.copy()
+    filled[hole] = np.clip(np.rint(colours[:, :3] * 255), 0, 255)
+    sources = image[field.rows[hole], field.cols[hole]]
+    misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
+    return Completion(filled, misfit)
 
 
-def _misfit(current: np.ndarray, hole: np.ndarray, field: NearestNeighbourField) -> float:
-    inside = hole & field.found
-    difference = (current[inside] - current[field.rows[inside], field.cols[inside]])[:, :3]
-    return 255 * float(np.sqrt(np.mean(difference**2))) if inside.any() else float("nan")
+def _level(
+    channels: np.ndarray,  # [h, w, 5], see _pyramid
+    hole: np.ndarray,  # [h, w] bool
+    field: NearestNeighbourField | None,  # of the coarser level
+    radius: int,
+    rounds: int,
+    settings: ExemplarSettings,
+) -> tuple[np.ndarray, NearestNeighbourField]:
+    """The hole's channels [N, 5] and the field of one level.
+
+    Patches are matched, then vote for the hole's colours, and again until little changes. A field from the
+    coarser level votes first: averaging what it copies is sharper than enlarging the coarser colours.
+    """
+    touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
+    allowed = patch_centres(~hole, radius)
+    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    penalty = np.float32(settings.locality / hole.shape[1]) * away
+    inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching]
+    trust = settings.rim_trust ** -np.minimum(inwards.astype(np.float64), FURTHEST_TRUST)
+    matching = PatchMatchSettings(
+        coherence=0.0, sweeps=settings.sweeps, tree_sweeps=1, reach=settings.reach, seed=settings.seed
+    )
+    index = None
+    patches, guides = lay_out(np.ascontiguousarray(channels[..., :3]), radius), channels[..., 3:].copy()
+    if field is None:
+        rows, cols = fill_inwards(channels, hole, allowed, radius)
+        colours = channels[rows[hole], cols[hole]]
+        index = index_patches(patches, allowed, 2)
+    else:
+        field = upsampled(field, touching)
+        usable = field.found
+        usable[usable] = allowed[field.rows[usable], field.cols[usable]]
+        field = replace(field, rows=np.where(usable, field.rows, -1))
+        colours = _voted(channels, hole, field, touching, trust, radius)
+    repaint = repainting(hole, radius)
+    for number in range(rounds):
+        repaint(patches, colours[:, :3])
+        guides[hole] = colours[:, 3:]
+        matching = replace(matching, seed=settings.seed + 31 * number)
+        field = refined(field, patches, touching, allowed, matching, penalty, index, guides)
+        costs = field.cost[touching]
+        sharpness = 1.0 / max(float(np.percentile(costs, 75)), 255.0**-2)
+        voted = _voted(
+            channels, hole, field, touching, trust * np.maximum(np.exp(-costs * sharpness), LEAST_SAY), radius
+        )
+        change = 255 * float(np.abs(voted - colours)[:, :3].mean())
+        colours = voted
+        if change < settings.settled:
+            break
+    assert field is not None
+    return colours, field
 
 
 def _pyramid(
     image: np.ndarray, hole: np.ndarray, radius: int, settings: ExemplarSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(channels [h, w, 5], hole) from fine to coarse, until the hole is about as thin as a patch."""
-    count, thickness = 1, _thickness(hole)
-    while min(hole.shape) > settings.smallest * 2**count and thickness > radius * 2 ** (count - 1):
+    """(channels [h, w, 5]: colours and texture features, hole) from fine to coarse."""
+    thickness = float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
+    count = 1
+    while min(hole.shape) > settings.smallest * 2**count and thickness > settings.thickness * radius * 2 ** (count - 1):
         count += 1
     colours = image.astype(np.float32) / 255
     levels = [(np.dstack([colours, _texture(colours, hole, 2 ** (count - 1), settings.texture)]), hole)]
@@ -113,126 +160,45 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Half the resolution; hole pixels do not mix into their neighbours."""
     size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
     known = (~hole).astype(np.float32)
-    total = _resized(channels * known[..., None], size, cv2.INTER_AREA)
+    parts = (channels * known[..., None])[..., :3], (channels * known[..., None])[..., 3:]  # OpenCV takes four at most
+    total = np.dstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
     share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
     return total / np.maximum(share, 1e-6)[..., None], share < 0.5
 
 
-def _resized(channels: np.ndarray, size: tuple[int, int], way: int) -> np.ndarray:
-    parts = channels[..., :3], channels[..., 3:]  # OpenCV takes at most four
-    return np.dstack([cv2.resize(part, size, interpolation=way) for part in parts])
-
-
-def _thickness(hole: np.ndarray) -> float:
-    return float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
-
-
-def _peeled(channels: np.ndarray, hole: np.ndarray, radius: int) -> np.ndarray:
-    """The hole filled inwards, ring by ring, each pixel from the patch that best continues the known."""
-    current, open_ = channels.copy(), hole.copy()
-    centres = np.argwhere(patch_centres(~hole, radius)).astype(np.int32)
-    if len(centres) == 0:  # not even one known pixel to copy
-        return current
-    centres = centres[:: -(-len(centres) // MOST_PEEL_SOURCES)]
-    while open_.any():
-        ring = open_ & (cv2.dilate((~open_).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-        filled = current.copy()
-        _fill_ring(np.argwhere(ring), centres, current, open_, radius, filled)
-        current, open_ = filled, open_ & ~ring
-    return current
-
-
-def _settled(
-    current: np.ndarray,
-    hole: np.ndarray,
-    touching: np.ndarray,  # [H, W] bool, centres of the patches that the hole changes
-    field: NearestNeighbourField | None,
-    radius: int,
-    rounds: int,
-    settings: ExemplarSettings,
-) -> tuple[np.ndarray, NearestNeighbourField]:
-    """Match the patches, let them vote for the hole's colours, and again until little changes."""
-    allowed = patch_centres(~hole, radius)
-    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    penalty = np.float32(settings.locality / hole.shape[1]) * away
-    index = index_patches(lay_out(current, radius), allowed, settings.grid) if allowed.any() else None
-    matching = PatchMatchSettings(coherence=0.0, tree_sweeps=1, sweeps=settings.sweeps, reach=settings.reach)
-    for number in range(rounds):
-        matching = replace(matching, seed=settings.seed + 31 * number)
-        field = refined(field, lay_out(current, radius), touching, allowed, matching, penalty, index)
-        sharpness = 1.0 / max(float(np.percentile(field.cost[touching], 75)), 255.0**-2)
-        voted = _voted(current, hole, field, settings, sharpness)
-        change = 255 * float(np.abs(voted - current)[hole][:, :3].mean())
-        current = voted
-        if change < settings.settled:
-            break
-    assert field is not None
-    return current, field
-
-
 def _voted(
-    current: np.ndarray,
+    channels: np.ndarray,
     hole: np.ndarray,
     field: NearestNeighbourField,
-    settings: ExemplarSettings,
-    sharpness: float,
+    touching: np.ndarray,
+    say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
+    radius: int,
 ) -> np.ndarray:
-    """What the overlapping patches say each hole pixel looks like, weighted by how well they fit."""
-    distance = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)
-    trust = (settings.rim_trust ** -np.minimum(distance, 40)).astype(np.float32)
-    voted = current.copy()
-    fitting = field.rows, field.cols, field.cost, trust, np.float32(sharpness), field.radius
-    run_ranges(_vote_rows, len(hole), current, hole, *fitting, voted, chunk=VOTE_ROWS)
+    """What the overlapping patches say each hole pixel looks like, [N, 5]."""
+    weights = np.zeros(hole.shape)
+    weights[touching] = say
+    places = np.argwhere(hole)
+    voted = np.empty((len(places), channels.shape[2]), np.float32)
+    votes = np.ascontiguousarray(channels), places, field.rows, field.cols, weights, radius
+    run_ranges(_vote, len(places), *votes, voted, chunk=VOTE_PIXELS)
     return voted
 
 
 @kernel
-def _fill_ring(ring, centres, known, open_, radius, out):
-    """Each ring pixel takes its value from the source patch that differs least where its own is known."""
-    h, w, channels = known.shape
-    for k in range(len(ring)):
-        y, x = ring[k]
-        best, best_v, best_u = float32(1e30), 0, 0
-        for s in range(len(centres)):
-            v, u = centres[s]
-            total = float32(0)
-            for dy in range(-radius, radius + 1):
-                for dx in range(-radius, radius + 1):
-                    a, b = y + dy, x + dx
-                    if a < 0 or b < 0 or a >= h or b >= w or open_[a, b]:
-                        continue
-                    for c in range(channels):
-                        d = known[a, b, c] - known[v + dy, u + dx, c]
-                        total += d * d
-                if total >= best:
-                    break
-            if total < best:
-                best, best_v, best_u = total, v, u
-        out[y, x] = known[best_v, best_u]
-
-
-@kernel
-def _vote_rows(lo, hi, current, hole, rows, cols, cost, trust, sharpness, radius, voted):
-    h, w, channels = current.shape
-    colour = np.empty(channels, np.float32)
-    for y in range(lo, hi):
-        for x in range(w):
-            if not hole[y, x]:
-                continue
-            total = float32(0)
-            colour[:] = 0
-            for dy in range(-radius, radius + 1):
-                for dx in range(-radius, radius + 1):
-                    a, b = y + dy, x + dx
-                    if a < 0 or b < 0 or a >= h or b >= w or rows[a, b] < 0:
-                        continue
-                    v, u = rows[a, b] - dy, cols[a, b] - dx
-                    if v < 0 or u < 0 or v >= h or u >= w:  # an upsampled field may point past the edge
-                        continue
-                    weight = trust[a, b] * np.exp(-cost[a, b] * sharpness) + float32(1e-12)
-                    total += weight
-                    for c in range(channels):
-                        colour[c] += weight * current[v, u, c]
-            if total > 0:
-                for c in range(channels):
-                    voted[y, x, c] = colour[c] / total
+def _vote(lo, hi, channels, places, rows, cols, weights, radius, voted):
+    h, w, count = channels.shape
+    sums = np.zeros(count)
+    for k in range(lo, hi):
+        y, x = places[k]
+        total = 0.0
+        for a in range(max(0, y - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x - radius), min(w, x + radius + 1)):
+                if rows[a, b] < 0:
+                    continue
+                v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                total += weights[a, b]
+                for c in range(count):
+                    sums[c] += weights[a, b] * channels[v, u, c]
+        for c in range(count):
+            voted[k, c] = sums[c] / total
+            sums[c] = 0.0

@@ -136,6 +136,7 @@ def refined(
     settings: PatchMatchSettings,
     penalty: np.ndarray | None = None,  # [H, W] float32
     index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
+    guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
@@ -143,12 +144,9 @@ def refined(
     cost = np.zeros((h, w), np.float32)
     if not allowed.any() or not target.any():
         return NearestNeighbourField(rows, cols, cost, patches.radius)
-    start = nearest_allowed(allowed)
-    if field is not None:
-        kept = field.found & target
-        kept[kept] = allowed[field.rows[kept], field.cols[kept]]
-        start = np.where(kept, field.rows, start[0]), np.where(kept, field.cols, start[1])
+    start = _first_guess(field, target, allowed)
     extra = np.zeros((h, w), np.float32) if penalty is None else penalty
+    guides = np.empty((h, w, 0), np.float32) if guides is None else guides
     weights = np.array([1 - settings.coherence, settings.coherence, settings.truncation**2, TIE / w], np.float32)
     looks, number = NO_LOOKS, np.zeros((h, w), np.int32)
     if index is not None:
@@ -159,7 +157,7 @@ def refined(
     bands = row_bands(target)
     for sweep in range(settings.sweeps):
         arguments = (
-            target, allowed, *patches, extra, *weights,
+            target, allowed, *patches, extra, *weights, guides,
             *tree, index is not None and sweep < settings.tree_sweeps, looks, number,
             *start, sweep == 0, sweep % 2 == 0, settings.reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
@@ -170,6 +168,20 @@ def refined(
 
 def _run_band(arguments: tuple[Any, ...], band: tuple[int, int]) -> None:
     _sweep_band(*band, *arguments)
+
+
+def _first_guess(
+    field: NearestNeighbourField | None, target: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The field where its sources are allowed, elsewhere the nearest allowed ones."""
+    if field is None:
+        return nearest_allowed(allowed)
+    kept = field.found & target
+    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+    if (kept == target).all():
+        return field.rows, field.cols
+    rows, cols = nearest_allowed(allowed)
+    return np.where(kept, field.rows, rows), np.where(kept, field.cols, cols)
 
 
 def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +215,7 @@ def _hash(x):
 @kernel
 def _sweep_band(
     lo, hi, target, allowed, values, stride, channels, radius, row_weights, penalty,
-    weight, coherence, truncation, tie,
+    weight, coherence, truncation, tie, guides,
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
     start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost,
 ):  # fmt: skip
@@ -298,6 +310,8 @@ def _sweep_band(
                                 total_deviation += min(float32((q + dy - c) ** 2 + (p + dx - d) ** 2), truncation)
                                 count += 1
                     extra += coherence * total_deviation / (truncation * float32(max(count, 1)))
+                for k in range(guides.shape[2]):
+                    extra += (guides[y, x, k] - guides[q, p, k]) ** 2
                 if extra + bound >= best:
                     continue
                 one, other = here, q * stride + p * channels
