@@ -17,8 +17,10 @@ from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
+from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
+NO_SUPPORT, NO_WARP = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
 LEAST_SAY = 1e-12  # of a patch that fits badly
 FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
@@ -53,11 +55,18 @@ def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
     settings: ExemplarSettings = ExemplarSettings(),
+    surface: Surface | None = None,  # what the picture shows
 ) -> Completion:
-    """Fill the hole so that every patch of it resembles one outside."""
+    """Fill the hole so that every patch of it resembles one outside.
+
+    With a surface patches are compared and copied along its tangent planes, and what lies on another surface
+    than the patch's centre, such as something that stands in front, is not compared.
+    """
     if not hole.any():
         return Completion(image.copy(), 0.0)
     radius = settings.patch // 2
+    if surface is not None:  # what is filled is mixed with nothing
+        surface = surface._replace(clear=surface.clear | hole)
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
@@ -66,7 +75,8 @@ def complete_picture(
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
         rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
-        colours, field = _level(channels, open_, field, radius, rounds, settings)
+        there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
+        colours, field = _level(channels, open_, there, field, radius, rounds, settings)
     assert field is not None
     filled = image.copy()
     filled[hole] = np.clip(np.rint(colours[:, :3] * 255), 0, 255)
@@ -78,6 +88,7 @@ def complete_picture(
 def _level(
     channels: np.ndarray,  # [h, w, 5], see _pyramid
     hole: np.ndarray,  # [h, w] bool
+    surface: Surface | None,
     field: NearestNeighbourField | None,  # of the coarser level
     radius: int,
     rounds: int,
@@ -90,6 +101,9 @@ def _level(
     """
     touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
     allowed = patch_centres(~hole, radius)
+    usable = ~hole if surface is None else ~hole & surface.clear
+    if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
+        allowed = whole
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     penalty = np.float32(settings.locality / hole.shape[1]) * away
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching]
@@ -100,25 +114,29 @@ def _level(
     index = None
     patches, guides = lay_out(np.ascontiguousarray(channels[..., :3]), radius), channels[..., 3:].copy()
     if field is None:
-        rows, cols = fill_inwards(channels, hole, allowed, radius)
+        rows, cols = fill_inwards(channels, hole, allowed, radius, surface, usable)
         colours = channels[rows[hole], cols[hole]]
-        index = index_patches(patches, allowed, 2)
+        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
+        if surface is None:
+            index = index_patches(patches, allowed, 2)
+        else:
+            matching = replace(matching, reach=max(hole.shape))
     else:
         field = upsampled(field, touching)
-        usable = field.found
-        usable[usable] = allowed[field.rows[usable], field.cols[usable]]
-        field = replace(field, rows=np.where(usable, field.rows, -1))
-        colours = _voted(channels, hole, field, touching, trust, radius)
+        kept = field.found
+        kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+        field = replace(field, rows=np.where(kept, field.rows, -1))
+        colours = _voted(channels, hole, field, touching, trust, radius, surface)
     repaint = repainting(hole, radius)
     for number in range(rounds):
         repaint(patches, colours[:, :3])
         guides[hole] = colours[:, 3:]
         matching = replace(matching, seed=settings.seed + 31 * number)
-        field = refined(field, patches, touching, allowed, matching, penalty, index, guides)
+        field = refined(field, patches, touching, allowed, matching, penalty, index, guides, surface, usable)
         costs = field.cost[touching]
         sharpness = 1.0 / max(float(np.percentile(costs, 75)), 255.0**-2)
         voted = _voted(
-            channels, hole, field, touching, trust * np.maximum(np.exp(-costs * sharpness), LEAST_SAY), radius
+            channels, hole, field, touching, trust * np.maximum(np.exp(-costs * sharpness), LEAST_SAY), radius, surface
         )
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
@@ -173,21 +191,30 @@ def _voted(
     touching: np.ndarray,
     say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
     radius: int,
+    surface: Surface | None,
 ) -> np.ndarray:
     """What the overlapping patches say each hole pixel looks like, [N, 5]."""
     weights = np.zeros(hole.shape)
     weights[touching] = say
     places = np.argwhere(hole)
     voted = np.empty((len(places), channels.shape[2]), np.float32)
+    number, support, warp = np.zeros(hole.shape, np.int32), NO_SUPPORT, NO_WARP
+    if surface is not None:
+        number[touching] = np.arange(len(say))
+        support = supports(surface, np.argwhere(touching), radius)
+        warp = warps(surface, touching, field.rows, field.cols)
     votes = np.ascontiguousarray(channels), places, field.rows, field.cols, weights, radius
-    run_ranges(_vote, len(places), *votes, voted, chunk=VOTE_PIXELS)
+    run_ranges(_vote, len(places), *votes, ~hole, surface is not None, number, support, warp, voted, chunk=VOTE_PIXELS)
     return voted
 
 
 @kernel
-def _vote(lo, hi, channels, places, rows, cols, weights, radius, voted):
+def _vote(
+    lo, hi, channels, places, rows, cols, weights, radius, usable, slanted, number, support, warp, voted
+):  # fmt: skip
     h, w, count = channels.shape
     sums = np.zeros(count)
+    side = 2 * radius + 1
     for k in range(lo, hi):
         y, x = places[k]
         total = 0.0
@@ -195,10 +222,32 @@ def _vote(lo, hi, channels, places, rows, cols, weights, radius, voted):
             for b in range(max(0, x - radius), min(w, x + radius + 1)):
                 if rows[a, b] < 0:
                     continue
-                v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                if not slanted:
+                    v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                    total += weights[a, b]
+                    for c in range(count):
+                        sums[c] += weights[a, b] * channels[v, u, c]
+                    continue
+                n = number[a, b]
+                if support[n, (y - a + radius) * side + x - b + radius] == 0:
+                    continue
+                fu = cols[a, b] + warp[n, 0] * (x - b) + warp[n, 1] * (y - a)
+                fv = rows[a, b] + warp[n, 2] * (x - b) + warp[n, 3] * (y - a)
+                if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
+                    continue
+                v, u = min(int(fv), h - 2), min(int(fu), w - 2)
+                if not (usable[v, u] and usable[v, u + 1] and usable[v + 1, u] and usable[v + 1, u + 1]):
+                    continue
+                s, t = fv - v, fu - u
                 total += weights[a, b]
                 for c in range(count):
-                    sums[c] += weights[a, b] * channels[v, u, c]
+                    top = (1 - t) * channels[v, u, c] + t * channels[v, u + 1, c]
+                    bottom = (1 - t) * channels[v + 1, u, c] + t * channels[v + 1, u + 1, c]
+                    sums[c] += weights[a, b] * ((1 - s) * top + s * bottom)
+        if total == 0.0:
+            for c in range(count):
+                sums[c] = channels[y, x, c]
+            total = 1.0
         for c in range(count):
             voted[k, c] = sums[c] / total
             sums[c] = 0.0
