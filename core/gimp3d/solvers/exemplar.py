@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy.fft
 
 from ..jit import kernel
 from ..threads import run_ranges
@@ -17,10 +18,14 @@ from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
+from .poisson import solve_poisson
 from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
 NO_SUPPORT, NO_WARP = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
+TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
+DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
+SCREENING = 0.01  # weight of the voted colours beside their gradients
 LEAST_SAY = 1e-12  # of a patch that fits badly
 FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
@@ -74,76 +79,141 @@ def complete_picture(
         return Completion(image.copy(), float("nan"))
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
-        rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
         there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
-        colours, field = _level(channels, open_, there, field, radius, rounds, settings)
+        level = _prepared(channels, open_, there, radius, settings)
+        rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
+        colours, field = _filled(level, field, rounds, settings)
     assert field is not None
-    filled = image.copy()
-    filled[hole] = np.clip(np.rint(colours[:, :3] * 255), 0, 255)
     sources = image[field.rows[hole], field.cols[hole]]
     misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
+    filled = image.copy()
+    filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
     return Completion(filled, misfit)
 
 
-def _level(
-    channels: np.ndarray,  # [h, w, 5], see _pyramid
-    hole: np.ndarray,  # [h, w] bool
-    surface: Surface | None,
-    field: NearestNeighbourField | None,  # of the coarser level
-    radius: int,
-    rounds: int,
-    settings: ExemplarSettings,
+@dataclass(frozen=True)
+class _Level:
+    """A level of the pyramid and what does not change while it is filled."""
+
+    channels: np.ndarray  # [h, w, 5] float32: colours and texture features
+    hole: np.ndarray  # [h, w] bool
+    touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
+    usable: np.ndarray  # [h, w] bool, pixels to copy
+    allowed: np.ndarray  # [h, w] bool, centres of patches to copy
+    trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
+    surface: Surface | None
+    radius: int
+
+
+def _prepared(
+    channels: np.ndarray, hole: np.ndarray, surface: Surface | None, radius: int, settings: ExemplarSettings
+) -> _Level:
+    touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
+    usable = ~hole if surface is None else ~hole & surface.clear
+    allowed = patch_centres(usable, radius)
+    if not allowed.any():
+        usable, allowed = ~hole, patch_centres(~hole, radius)
+    if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
+        allowed = whole
+    inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
+    trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
+    return _Level(channels, hole, touching, usable, allowed, trust, surface, radius)
+
+
+def _filled(
+    level: _Level, coarser: NearestNeighbourField | None, rounds: int, settings: ExemplarSettings
 ) -> tuple[np.ndarray, NearestNeighbourField]:
     """The hole's channels [N, 5] and the field of one level.
 
     Patches are matched, then vote for the hole's colours, and again until little changes. A field from the
     coarser level votes first: averaging what it copies is sharper than enlarging the coarser colours.
     """
-    touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-    allowed = patch_centres(~hole, radius)
-    usable = ~hole if surface is None else ~hole & surface.clear
-    if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
-        allowed = whole
-    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    penalty = np.float32(settings.locality / hole.shape[1]) * away
-    inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching]
-    trust = settings.rim_trust ** -np.minimum(inwards.astype(np.float64), FURTHEST_TRUST)
-    matching = PatchMatchSettings(
-        coherence=0.0, sweeps=settings.sweeps, tree_sweeps=1, reach=settings.reach, seed=settings.seed
-    )
-    index = None
-    patches, guides = lay_out(np.ascontiguousarray(channels[..., :3]), radius), channels[..., 3:].copy()
-    if field is None:
-        rows, cols = fill_inwards(channels, hole, allowed, radius, surface, usable)
-        colours = channels[rows[hole], cols[hole]]
+    hole, allowed, radius = level.hole, level.allowed, level.radius
+    patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
+    guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
+    matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, tree_sweeps=1, reach=settings.reach)
+    if coarser is None:
+        rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.surface, level.usable)
+        colours = level.channels[rows[hole], cols[hole]]
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
-        if surface is None:
-            index = index_patches(patches, allowed, 2)
+        if level.surface is None:
+            index = index_patches(patches, allowed, TREE_GRID)
         else:
             matching = replace(matching, reach=max(hole.shape))
     else:
-        field = upsampled(field, touching)
+        field = upsampled(coarser, level.touching)
         kept = field.found
         kept[kept] = allowed[field.rows[kept], field.cols[kept]]
         field = replace(field, rows=np.where(kept, field.rows, -1))
-        colours = _voted(channels, hole, field, touching, trust, radius, surface)
-    repaint = repainting(hole, radius)
+        colours = _voted(level, field, level.trust, level.channels[hole])
+    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    penalty = np.float32(settings.locality / hole.shape[1]) * away
     for number in range(rounds):
         repaint(patches, colours[:, :3])
         guides[hole] = colours[:, 3:]
         matching = replace(matching, seed=settings.seed + 31 * number)
-        field = refined(field, patches, touching, allowed, matching, penalty, index, guides, surface, usable)
-        costs = field.cost[touching]
-        sharpness = 1.0 / max(float(np.percentile(costs, 75)), 255.0**-2)
-        voted = _voted(
-            channels, hole, field, touching, trust * np.maximum(np.exp(-costs * sharpness), LEAST_SAY), radius, surface
+        field = refined(
+            field, patches, level.touching, allowed, matching, penalty, index, guides, level.surface, level.usable
         )
+        voted = _voted(level, field, _say(level, field), colours)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
         if change < settings.settled:
             break
-    assert field is not None
     return colours, field
+
+
+def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
+    """[touching pixels] float64: the weight of each patch's vote."""
+    costs = field.cost[level.touching]
+    typical = max(float(np.percentile(costs, 75)), 255.0**-2)
+    return level.trust * np.maximum(np.exp(-costs / typical), LEAST_SAY)
+
+
+def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
+    """The hole's colours [N, 3] without seams: the gradients that the patches vote for, fixed at the rim.
+
+    Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Rim pixels that the patches do not
+    agree with at all, such as remains of what was removed, do not spread.
+    """
+    hole = level.hole
+    say = _say(level, field)
+    picture = level.channels[..., :3].astype(np.float64)
+    picture[hole] = colours[:, :3]
+    rim = (cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & level.usable
+    voted = _voted(level, field, say, picture[rim], rim)
+    rim[rim] = np.abs(voted - picture[rim]).max(1) < DISAGREEMENT
+    rows, cols = np.nonzero(hole)
+    top, left = max(0, rows.min() - 1), max(0, cols.min() - 1)
+    box = np.s_[top : rows.max() + 2, left : cols.max() + 2]
+    slopes = []
+    for dy, dx in ((0, 1), (1, 0)):
+        slope = np.zeros_like(picture)
+        slope[: slope.shape[0] - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
+        across = hole.copy()  # pixels whose step to the right or down begins or ends in the hole
+        across[: hole.shape[0] - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
+        across[hole.shape[0] - dy :], across[:, hole.shape[1] - dx :] = False, False
+        slope[across] = _voted(level, field, say, slope[across], across, (dy, dx))
+        slopes.append(slope[box])
+    guidance = np.full_like(picture, np.nan)
+    guidance[box] = _picture_of(*slopes)
+    drawn = np.where(hole, SCREENING, 0.0)
+    solution = solve_poisson(hole, rim, picture, guidance, weight=drawn, anchor=picture)
+    return solution.values[hole]
+
+
+def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT)."""
+    h, w, _ = along_x.shape
+    divergence = np.zeros_like(along_x)
+    divergence[:, :-1] += along_x[:, :-1]
+    divergence[:, 1:] -= along_x[:, :-1]
+    divergence[:-1] += along_y[:-1]
+    divergence[1:] -= along_y[:-1]
+    waves = scipy.fft.dctn(divergence, axes=(0, 1))
+    eigenvalues = 2 * (np.cos(np.pi * np.arange(h) / h)[:, None] + np.cos(np.pi * np.arange(w) / w)) - 4
+    eigenvalues[0, 0] = 1.0
+    return scipy.fft.idctn(waves / eigenvalues[..., None], axes=(0, 1))
 
 
 def _pyramid(
@@ -185,69 +255,79 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _voted(
-    channels: np.ndarray,
-    hole: np.ndarray,
+    level: _Level,
     field: NearestNeighbourField,
-    touching: np.ndarray,
     say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
-    radius: int,
-    surface: Surface | None,
+    otherwise: np.ndarray,  # [N, C], where nothing is voted for
+    where: np.ndarray | None = None,  # [h, w] bool, N pixels; None: the hole
+    step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each hole pixel looks like, [N, 5]."""
-    weights = np.zeros(hole.shape)
-    weights[touching] = say
-    places = np.argwhere(hole)
-    voted = np.empty((len(places), channels.shape[2]), np.float32)
-    number, support, warp = np.zeros(hole.shape, np.int32), NO_SUPPORT, NO_WARP
-    if surface is not None:
-        number[touching] = np.arange(len(say))
-        support = supports(surface, np.argwhere(touching), radius)
-        warp = warps(surface, touching, field.rows, field.cols)
-    votes = np.ascontiguousarray(channels), places, field.rows, field.cols, weights, radius
-    run_ranges(_vote, len(places), *votes, ~hole, surface is not None, number, support, warp, voted, chunk=VOTE_PIXELS)
+    """What the overlapping patches say each pixel looks like, [N, C]."""
+    places = np.argwhere(level.hole if where is None else where)
+    weights = np.zeros(level.hole.shape)
+    weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
+    number, support, warp = np.zeros(weights.shape, np.int32), NO_SUPPORT, NO_WARP
+    if level.surface is not None:
+        number[level.touching] = np.arange(len(say))
+        support = supports(level.surface, np.argwhere(level.touching), level.radius)
+        warp = warps(level.surface, level.touching, field.rows, field.cols)
+    voted = otherwise.astype(np.float32)
+    channels = np.ascontiguousarray(level.channels[..., : voted.shape[1]])
+    slanted = level.surface is not None
+    parts = field.rows, field.cols, weights, level.radius, level.usable, slanted, number, support, warp
+    run_ranges(_vote, len(places), channels, places, *step, *parts, voted, chunk=VOTE_PIXELS)
     return voted
 
 
 @kernel
 def _vote(
-    lo, hi, channels, places, rows, cols, weights, radius, usable, slanted, number, support, warp, voted
+    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, slanted, number, support, warp, voted
 ):  # fmt: skip
     h, w, count = channels.shape
-    sums = np.zeros(count)
+    sums, one = np.empty(count), np.empty(count)
     side = 2 * radius + 1
+    ends = 1 if dy == 0 and dx == 0 else 2
     for k in range(lo, hi):
         y, x = places[k]
         total = 0.0
-        for a in range(max(0, y - radius), min(h, y + radius + 1)):
-            for b in range(max(0, x - radius), min(w, x + radius + 1)):
-                if rows[a, b] < 0:
+        sums[:] = 0.0
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+                if weights[a, b] == 0.0:
                     continue
-                if not slanted:
-                    v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                n, votes = number[a, b], True
+                one[:] = 0.0
+                for end in range(ends):
+                    i, j = y + end * dy - a, x + end * dx - b
+                    sign = 1.0 if end == ends - 1 else -1.0
+                    fv, fu = float(rows[a, b] + i), float(cols[a, b] + j)
+                    if slanted:
+                        fu = cols[a, b] + warp[n, 0] * j + warp[n, 1] * i
+                        fv = rows[a, b] + warp[n, 2] * j + warp[n, 3] * i
+                        if support[n, (i + radius) * side + j + radius] == 0:
+                            votes = False
+                    if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
+                        votes = False
+                    if not votes:
+                        break
+                    v, u = int(fv), int(fu)
+                    v1, u1 = min(v + 1, h - 1), min(u + 1, w - 1)
+                    s, t = fv - v, fu - u
+                    if not (usable[v, u] and usable[v, u1] and usable[v1, u] and usable[v1, u1]):
+                        if not usable[v, u] or slanted:
+                            votes = False
+                            break
+                    for c in range(count):
+                        if slanted:
+                            top = (1 - t) * channels[v, u, c] + t * channels[v, u1, c]
+                            bottom = (1 - t) * channels[v1, u, c] + t * channels[v1, u1, c]
+                            one[c] += sign * ((1 - s) * top + s * bottom)
+                        else:
+                            one[c] += sign * channels[v, u, c]
+                if votes:
                     total += weights[a, b]
                     for c in range(count):
-                        sums[c] += weights[a, b] * channels[v, u, c]
-                    continue
-                n = number[a, b]
-                if support[n, (y - a + radius) * side + x - b + radius] == 0:
-                    continue
-                fu = cols[a, b] + warp[n, 0] * (x - b) + warp[n, 1] * (y - a)
-                fv = rows[a, b] + warp[n, 2] * (x - b) + warp[n, 3] * (y - a)
-                if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
-                    continue
-                v, u = min(int(fv), h - 2), min(int(fu), w - 2)
-                if not (usable[v, u] and usable[v, u + 1] and usable[v + 1, u] and usable[v + 1, u + 1]):
-                    continue
-                s, t = fv - v, fu - u
-                total += weights[a, b]
-                for c in range(count):
-                    top = (1 - t) * channels[v, u, c] + t * channels[v, u + 1, c]
-                    bottom = (1 - t) * channels[v + 1, u, c] + t * channels[v + 1, u + 1, c]
-                    sums[c] += weights[a, b] * ((1 - s) * top + s * bottom)
-        if total == 0.0:
+                        sums[c] += weights[a, b] * one[c]
+        if total > 0.0:
             for c in range(count):
-                sums[c] = channels[y, x, c]
-            total = 1.0
-        for c in range(count):
-            voted[k, c] = sums[c] / total
-            sums[c] = 0.0
+                voted[k, c] = sums[c] / total
