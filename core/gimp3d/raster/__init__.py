@@ -39,6 +39,7 @@ __all__ = [
     "footprint",
     "pixel_region",
     "render",
+    "surface_depth",
     "trace",
     "use_backend",
 ]
@@ -115,6 +116,19 @@ def footprint(
 ) -> np.ndarray:
     """Accumulated blend weight of the chosen Gaussians, [H, W] float32; others may hide them."""
     return current_backend().footprint(gaussians, camera, chosen, settings)
+
+
+def surface_depth(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings = RasterSettings(),
+) -> tuple[np.ndarray, np.ndarray]:
+    """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha; both [H, W] float32.
+
+    `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
+    splats (Yu 2024; Zhang 2024). 0 where alpha < 0.5.
+    """
+    return current_backend().surface_depth(gaussians, camera, settings)
 
 
 def contributions(

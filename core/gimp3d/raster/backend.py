@@ -10,6 +10,7 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from . import cpu
 from .region import CpuPixelRegion
+from .surface import surface_depth
 from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering
 
 
@@ -55,6 +56,10 @@ class Backend(Protocol):
         self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
     ) -> np.ndarray: ...
 
+    def surface_depth(
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
     def contributions(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
     ) -> Contributions: ...
@@ -67,6 +72,7 @@ class CpuBackend:
     trace = staticmethod(cpu.trace)
     pixel_region = staticmethod(CpuPixelRegion)
     footprint = staticmethod(cpu.footprint)
+    surface_depth = staticmethod(surface_depth)
     contributions = staticmethod(cpu.contributions)
 
 

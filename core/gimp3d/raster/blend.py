@@ -259,14 +259,14 @@ def blend_range(
                     after = before - weight
                     store16(state, k + T, after)
                     if with_rgb:
-                        _add_colour(state, k, weight, red, green, blue)
+                        _add_three(state, k + R, weight, red, green, blue)
                     if with_depth:
                         z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
                         store16(state, k + Z, fma16(weight, z - shift, load16(state, k + Z)))
                     if with_median:
                         _mark_median(state, k, before, after, number)
                     if with_normals:
-                        _add_normal(state, k, weight, nx, ny, nz)
+                        _add_three(state, k + NX, weight, nx, ny, nz)
                     if with_distortion:
                         m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                         _add_disparity(state, k, weight, m)
@@ -288,13 +288,13 @@ def blend_range(
                     after = before - weight
                     store16(state, k + T, after)
                     if with_rgb:
-                        _add_colour(state, k, weight, red, green, blue)
+                        _add_three(state, k + R, weight, red, green, blue)
                     if with_depth:
                         store16(state, k + Z, fma16(weight, depth - shift, load16(state, k + Z)))
                     if with_median:
                         _mark_median(state, k, before, after, number)
                     if with_normals:
-                        _add_normal(state, k, weight, nx, ny, nz)
+                        _add_three(state, k + NX, weight, nx, ny, nz)
                     if with_distortion:
                         _add_disparity(state, k, weight, m)
             i += 1
@@ -309,23 +309,17 @@ def blend_range(
 
 
 @inline_kernel
-def _add_colour(state, k, weight, red, green, blue):
-    store16(state, k + R, fma16(weight, red, load16(state, k + R)))
-    store16(state, k + G, fma16(weight, green, load16(state, k + G)))
-    store16(state, k + B, fma16(weight, blue, load16(state, k + B)))
+def _add_three(state, k, weight, a, b, c):
+    """Add a weighted colour or normal to the three planes from k on."""
+    store16(state, k, fma16(weight, a, load16(state, k)))
+    store16(state, k + 16, fma16(weight, b, load16(state, k + 16)))
+    store16(state, k + 32, fma16(weight, c, load16(state, k + 32)))
 
 
 @inline_kernel
 def _mark_median(state, k, before, after, number):
     crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
     store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
-
-
-@inline_kernel
-def _add_normal(state, k, weight, nx, ny, nz):
-    store16(state, k + NX, fma16(weight, nx, load16(state, k + NX)))
-    store16(state, k + NY, fma16(weight, ny, load16(state, k + NY)))
-    store16(state, k + NZ, fma16(weight, nz, load16(state, k + NZ)))
 
 
 @inline_kernel

@@ -51,7 +51,6 @@ ZERO, HALF = np.float32(0), np.float32(0.5)
 # float64 numbers as bits, for exp and log2 that vectorise (libm's calls do not)
 ROUNDING = 1.5 * 2.0**52  # added to a float64 it leaves the nearest integer in the low mantissa bits
 MANTISSA_BITS = np.int64(0xFFFFFFFFFFFFF)
-ONE_BITS = np.int64(0x3FF0000000000000)
 INTEGER_BITS, INTEGER_OFFSET = np.int64(0x4330000000000000), 2.0**52  # float_of(INTEGER_BITS | k) = 2^52 + k
 
 # Real spherical harmonics in 3DGS's order and signs.

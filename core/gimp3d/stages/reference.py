@@ -10,24 +10,39 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import IllPosed
+from ..threads import parallel_map
 from .depth import complete_disparity
 from .masks import ViewMasks, sees
 
 
 @dataclass(frozen=True)
 class ReferenceSettings:
-    """What makes a reference acceptable."""
+    """How the hidden surface is sampled and what a view of it is worth. Lengths in pixels."""
 
     minimum_pixels: int = 1  # a view with fewer hole pixels cannot be the reference
-    truncation_power: float = 2.0  # how hard a hole cut by the frame is punished
+    surface_views: int = 12  # views, evenly chosen, that say where the hidden surface may be
+    samples: int = 2000  # of the surface from each of them, about
+    most_extra: int = 8  # further references that a plan looks ahead
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """What a view would explain of the hidden surface; shares of its area, 0 to 1."""
+
+    camera_id: str
+    score: float  # Σ over the surface of visible × cos θ × pixels per area, each relative to the best view of it
+    covered: float  # share of the surface that the view shows
+    facing: float  # mean cos θ where it does
+    detail: float  # mean pixels per area there, relative to the view that shows most
 
 
 @dataclass(frozen=True)
 class ReferenceChoice:
-    """The chosen view and why; `scores` holds (camera ID, score) of every candidate, best first."""
+    """The chosen view and why."""
 
     camera_id: str
-    scores: tuple[tuple[str, float], ...]
+    scores: tuple[ViewScore, ...]  # of every candidate, best first
+    plan: tuple[tuple[str, float], ...]  # the chosen view, then greedily the next: (camera ID, share covered by then)
     confidence: float
     reason: str
 
@@ -81,48 +96,125 @@ def rim(view: ViewMasks, solid: float) -> np.ndarray:
     return ~view.target & (view.alpha_after > solid) & (view.depth_after > 0)
 
 
+@dataclass(frozen=True)
+class NeededSurface:
+    """Samples of the surface that has to be made up, one per patch of equal area."""
+
+    points: np.ndarray  # [S, 3] float64, world
+    normals: np.ndarray  # [S, 3] unit, world, facing the view they come from
+
+
+def needed_surface(
+    views: Sequence[ViewMasks], solid: float = 0.9, settings: ReferenceSettings = ReferenceSettings()
+) -> NeededSurface:
+    """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
+    seeing = [v for v in views if v.target.sum() >= settings.minimum_pixels]
+    step = max(1, -(-len(seeing) // settings.surface_views))
+    parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step])
+    points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
+    if not len(points):
+        return NeededSurface(points, normals)
+    cell = float(np.median(sizes))
+    # The first sample in each cell stands for it, so that views do not count by the number of their pixels.
+    _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
+    return NeededSurface(points[np.sort(first)], normals[np.sort(first)])
+
+
+def _surface_in(view: ViewMasks, solid: float, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
+    """Points and normals [M, 3] in the world and their spacing [M, 1], from one view's hole; none if it has no rim."""
+    try:
+        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target)
+    except IllPosed:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
+    depth = np.where(view.target, completed.depth, view.depth_after)
+    normals = surface_normals(view.camera, depth)
+    rows, cols = np.nonzero(view.target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
+    stride = max(1, round(np.sqrt(len(rows) / settings.samples)))
+    grid = (rows % stride == 0) & (cols % stride == 0)
+    rows, cols = rows[grid], cols[grid]
+    z = depth[rows, cols].astype(np.float64)
+    points = view.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
+    spacing = 2 * stride * z / np.sqrt(view.camera.fx * view.camera.fy)
+    return points, normals[rows, cols] @ view.camera.R, spacing[:, None]
+
+
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
     solid: float = 0.9,
     settings: ReferenceSettings = ReferenceSettings(),
 ) -> ReferenceChoice:
-    """The view that shows most of the needed surface, square on and not cut off by the frame.
+    """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
-    Score: the sum over the hole's pixels of cos θ to the provisionally completed surface, which is the surface
-    integral of visible × cos θ × pixels per area, times the framed share of the hole (METHOD section 2).
+    Score: Σ over the needed surface of visible × cos θ × pixels per area (METHOD section 2), each sample relative to
+    the best view of it: 1 is a view that shows everything as well as any does. The plan goes on greedily with the
+    views that cover most of what the ones before do not.
 
     Raises
     ------
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    scores = sorted(((v.camera.id, _score(v, solid, settings)) for v in views), key=lambda s: (-s[1], s[0]))
-    usable = [s for s in scores if s[1] > 0]
-    if wanted is not None:
-        if wanted not in dict(usable):
-            raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
-        chosen = wanted
-    elif usable:
-        chosen = usable[0][0]
-    else:
+    surface = needed_surface(views, solid, settings)
+    seen = [_seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None for v in views]
+    candidates = [(v, *s) for v, s in zip(views, seen) if s is not None and s[0].any() and _has_rim(v, solid)]
+    if not candidates:
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
-    best, score = usable[0][1], dict(usable)[chosen]
-    how = "as asked" if wanted else "sees most of the hidden surface"
-    return ReferenceChoice(chosen, tuple(scores), score / best, f"{chosen}: {how} (score {score:.0f}, best {best:.0f})")
+    best_worth = np.max([cosine * density for _, cosine, density in candidates], axis=0)
+    best_density = np.max([density for _, _, density in candidates], axis=0)
+
+    def score(view: ViewMasks, cosine: np.ndarray, density: np.ndarray) -> ViewScore:
+        shown = cosine > 0
+        worth = (cosine * density)[shown] / best_worth[shown]
+        detail = float((density[shown] / best_density[shown]).mean())
+        return ViewScore(view.camera.id, worth.sum() / len(shown), shown.mean(), float(cosine[shown].mean()), detail)
+
+    scores = sorted((score(*c) for c in candidates), key=lambda s: (-s.score, s.camera_id))
+    if wanted is not None and wanted not in {s.camera_id for s in scores}:
+        raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
+    chosen = next(s for s in scores if wanted in (None, s.camera_id))
+    plan = _plan({v.camera.id: cosine > 0 for v, cosine, _ in candidates}, scores, chosen.camera_id, settings)
+    how = "as asked" if wanted else "explains most of the hidden surface"
+    reason = (
+        f"{chosen.camera_id}: {how}: shows {chosen.covered:.0%} of it, facing it by cos {chosen.facing:.2f}, with "
+        f"{chosen.detail:.0%} of the finest detail (score {chosen.score:.2f}, best {scores[0].score:.2f})"
+    )
+    if len(plan) > 1:
+        reason += "; then " + ", ".join(f"{name} to {share:.0%}" for name, share in plan[1:3])
+    return ReferenceChoice(chosen.camera_id, tuple(scores), plan, chosen.score / scores[0].score, reason)
 
 
-def _score(view: ViewMasks, solid: float, settings: ReferenceSettings) -> float:
-    if view.target.sum() < settings.minimum_pixels:
-        return 0.0
-    try:
-        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target)
-    except IllPosed:
-        return 0.0
-    cosine = facing(view.camera, np.where(view.target, completed.depth, view.depth_after))[view.target].sum()
-    on_border = view.target[0].sum() + view.target[-1].sum() + view.target[:, 0].sum() + view.target[:, -1].sum()
-    framed = max(0.0, 1.0 - on_border / max(1.0, 2 * np.sqrt(view.target.sum())))
-    return float(cosine * framed**settings.truncation_power)
+def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
+    """cos θ and pixels per area [S] of each sample in a view's hole; both 0 where it does not show it."""
+    camera = view.camera
+    uv, z = camera.project(surface.points)
+    with np.errstate(invalid="ignore"):
+        framed = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    cols, rows = np.where(framed[:, None], uv, 0).astype(int).T
+    cosine = -(surface.normals * _directions(surface.points, camera)).sum(-1)
+    shown = framed & view.target[rows, cols] & (cosine > 0)
+    density = cosine * camera.fx * camera.fy / np.where(shown, z, 1) ** 2
+    return np.where(shown, cosine, 0.0), np.where(shown, density, 0.0)
+
+
+def _has_rim(view: ViewMasks, solid: float) -> bool:
+    """Whether anything known bounds the hole."""
+    grown = cv2.dilate(view.target.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return bool((grown & rim(view, solid)).any())
+
+
+def _plan(
+    shown: dict[str, np.ndarray], scores: Sequence[ViewScore], first: str, settings: ReferenceSettings
+) -> tuple[tuple[str, float], ...]:
+    """The views that cover most, one after the other (greedy maximum coverage, Nemhauser 1978)."""
+    order = {s.camera_id: k for k, s in enumerate(scores)}
+    open_, name, plan = np.ones(len(shown[first]), bool), first, []
+    while True:
+        open_ &= ~shown[name]
+        plan.append((name, float(1 - open_.mean())))
+        name = max(order, key=lambda n: ((shown[n] & open_).sum(), -order[n]))
+        if not (shown[name] & open_).any() or len(plan) > settings.most_extra:
+            return tuple(plan)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from ..camera import Camera
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
 from ..solvers.harmonics import fit_anchored_sh, residual_weights
 from .masks import sees
-from .propagate import PaintedView, Rule, ViewToPaint
+from .propagate import Loader, PaintedView, Rule
 from .reference import surface_normals
 
 
@@ -69,7 +69,7 @@ def seed_gaussians(
 def colour_gaussians(
     seeds: Gaussians,
     reference: Camera,
-    views: Sequence[ViewToPaint],
+    views: Sequence[Loader],
     painted: Sequence[PaintedView],
     scene_degree: int,
     settings: SeedSettings = SeedSettings(),
@@ -83,13 +83,16 @@ def colour_gaussians(
     residuals = np.zeros((len(seeds), len(views), 3), np.float32)
     directions = np.zeros((len(seeds), len(views), 3), np.float32)
     observed = np.zeros((len(seeds), len(views)), bool)
-    for k, (view, paint) in enumerate(zip(views, painted)):
+    for k, (load, paint) in enumerate(zip(views, painted)):
+        view = load()
         visible = sees(view.camera, view.depth_new, means, settings.depth_tolerance)
         uv, _ = view.camera.project(means[visible])
         cols, rows = uv.astype(int).T
-        trusted = np.isin(paint.rules[rows, cols], (Rule.EVIDENCE, Rule.OWN_PIXELS))
+        rules = paint.rule_map(view.camera.height, view.camera.width)
+        trusted = np.isin(rules[rows, cols], (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED))
         index = np.flatnonzero(visible)[trusted]
-        residuals[index, k] = paint.image[rows[trusted], cols[trusted]] / 255.0 - anchor[index]
+        seen = paint.image[rows[trusted] - paint.top, cols[trusted] - paint.left]
+        residuals[index, k] = seen / 255.0 - anchor[index]
         observed[index, k] = True
         towards = means - view.camera.centre
         directions[:, k] = towards / np.linalg.norm(towards, axis=-1, keepdims=True)

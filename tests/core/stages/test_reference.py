@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
@@ -12,7 +14,14 @@ from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 from gimp3d.stages.masks import find_masks
-from gimp3d.stages.reference import EvidenceSettings, choose_reference, facing, gather_evidence, surface_normals
+from gimp3d.stages.reference import (
+    EvidenceSettings,
+    choose_reference,
+    facing,
+    gather_evidence,
+    needed_surface,
+    surface_normals,
+)
 
 UP = np.array([0, 0, 1.0])
 
@@ -25,11 +34,38 @@ def test_the_steep_view_wins_over_the_grazing_one_and_the_cut_off_one() -> None:
     views = [
         camera_at("grazing", (2.2, 0, 0.5)),
         camera_at("steep", (0.8, 0.3, 2.0)),
-        camera_at("cut off", (0.8, 0.3, 2.0), (0.95, 0.9, 0)),
+        camera_at("cut off", (0.8, 0.3, 2.0), (0.65, 0.65, 0)),
     ]
     choice = choose_reference(find_masks(scene(), REGION, views).views)
     assert choice.camera_id == "steep" and choice.confidence == 1
-    assert [name for name, _ in choice.scores][-1] != "steep"
+    scores = {s.camera_id: s for s in choice.scores}
+    assert scores["steep"].covered > 0.75 and scores["grazing"].covered > 0.75
+    assert scores["cut off"].covered < 0.8 * scores["steep"].covered
+    assert scores["grazing"].facing < 0.5 * scores["steep"].facing
+    assert all(0 < s.score <= 1 and 0 < s.detail <= 1 for s in choice.scores)
+
+
+def test_what_one_view_does_not_show_is_planned_for_the_next() -> None:
+    masks = find_masks(scene(), REGION, cameras())
+    left, right = (np.arange(120) < 60)[None], (np.arange(120) >= 60)[None]
+    first = masks.views[0]
+    views = [
+        replace(first, camera=replace(first.camera, id=name), target=first.target & part)
+        for name, part in (("left", left), ("right", right))
+    ]
+    choice = choose_reference([*views, replace(first, camera=replace(first.camera, id="none"), target=left & right)])
+    assert {name for name, _ in choice.plan} == {"left", "right"}
+    shares = [share for _, share in choice.plan]
+    assert 0.2 < shares[0] < 0.8 and shares[1] == 1.0
+    assert choice.plan[1][0] in choice.reason
+
+
+def test_the_needed_surface_is_the_floor_under_the_object() -> None:
+    surface = needed_surface(find_masks(scene(), REGION, cameras()).views)
+    assert len(surface.points) > 100
+    assert np.percentile(np.abs(surface.points[:, 2]), 90) < 0.05  # the floor lies at z = 0
+    assert np.median(surface.normals[:, 2]) > 0.95
+    assert np.abs(surface.points[:, :2]).max() < 2
 
 
 def test_a_wanted_view_is_taken_unless_it_does_not_see_the_hole() -> None:
