@@ -405,7 +405,8 @@ def _appearance(
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
-    filled = inpaint_reference(settings.inpaint, base, view.target & ~seen, settings.random_seed)
+    hole = view.target & ~seen
+    filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 

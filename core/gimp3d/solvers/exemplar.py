@@ -18,14 +18,14 @@ from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
-from .poisson import solve_poisson
+from .poisson import solve_hole
 from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-NO_SUPPORT, NO_WARP = np.empty((0, 0), np.uint8), np.empty((0, 0), np.float32)
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
+SELECTIVE = 4.0  # a patch that only a quarter fits worse than votes by e^-4: higher is sharper, and noisier
 LEAST_SAY = 1e-12  # of a patch that fits badly
 FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
@@ -166,8 +166,8 @@ def _filled(
 def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
     """[touching pixels] float64: the weight of each patch's vote."""
     costs = field.cost[level.touching]
-    typical = max(float(np.percentile(costs, 75)), 255.0**-2)
-    return level.trust * np.maximum(np.exp(-costs / typical), LEAST_SAY)
+    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
+    return level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
 
 
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
@@ -176,30 +176,31 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Rim pixels that the patches do not
     agree with at all, such as remains of what was removed, do not spread.
     """
-    hole = level.hole
-    say = _say(level, field)
-    picture = level.channels[..., :3].astype(np.float64)
+    rows, cols = np.nonzero(level.hole)
+    box = np.s_[max(0, rows.min() - 1) : rows.max() + 2, max(0, cols.min() - 1) : cols.max() + 2]
+    hole = level.hole[box]
+    picture = level.channels[box][..., :3].copy()
     picture[hole] = colours[:, :3]
-    rim = (cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & level.usable
-    voted = _voted(level, field, say, picture[rim], rim)
-    rim[rim] = np.abs(voted - picture[rim]).max(1) < DISAGREEMENT
-    rows, cols = np.nonzero(hole)
-    top, left = max(0, rows.min() - 1), max(0, cols.min() - 1)
-    box = np.s_[top : rows.max() + 2, left : cols.max() + 2]
+    say = _say(level, field)
+
+    def wanted(where: np.ndarray, otherwise: np.ndarray, step: tuple[int, int] = (0, 0)) -> np.ndarray:
+        whole = np.zeros(level.hole.shape, bool)
+        whole[box] = where
+        return _voted(level, field, say, otherwise, whole, step)
+
+    rim = (cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hole & level.usable[box]
+    rim[rim] = np.abs(wanted(rim, picture[rim]) - picture[rim]).max(1) < DISAGREEMENT
     slopes = []
     for dy, dx in ((0, 1), (1, 0)):
         slope = np.zeros_like(picture)
-        slope[: slope.shape[0] - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
+        slope[: len(slope) - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
         across = hole.copy()  # pixels whose step to the right or down begins or ends in the hole
-        across[: hole.shape[0] - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
-        across[hole.shape[0] - dy :], across[:, hole.shape[1] - dx :] = False, False
-        slope[across] = _voted(level, field, say, slope[across], across, (dy, dx))
-        slopes.append(slope[box])
-    guidance = np.full_like(picture, np.nan)
-    guidance[box] = _picture_of(*slopes)
+        across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
+        across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
+        slope[across] = wanted(across, slope[across], (dy, dx))
+        slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
-    solution = solve_poisson(hole, rim, picture, guidance, weight=drawn, anchor=picture)
-    return solution.values[hole]
+    return solve_hole(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values
 
 
 def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
@@ -262,68 +263,87 @@ def _voted(
     where: np.ndarray | None = None,  # [h, w] bool, N pixels; None: the hole
     step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each pixel looks like, [N, C]."""
+    """What the overlapping patches say each pixel looks like, [N, C] float32."""
     places = np.argwhere(level.hole if where is None else where)
     weights = np.zeros(level.hole.shape)
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
-    number, support, warp = np.zeros(weights.shape, np.int32), NO_SUPPORT, NO_WARP
-    if level.surface is not None:
+    voted = otherwise.astype(np.float32)
+    parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius
+    if level.surface is None:
+        run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
+    else:
+        number = np.zeros(weights.shape, np.int32)
         number[level.touching] = np.arange(len(say))
         support = supports(level.surface, np.argwhere(level.touching), level.radius)
         warp = warps(level.surface, level.touching, field.rows, field.cols)
-    voted = otherwise.astype(np.float32)
-    channels = np.ascontiguousarray(level.channels[..., : voted.shape[1]])
-    slanted = level.surface is not None
-    parts = field.rows, field.cols, weights, level.radius, level.usable, slanted, number, support, warp
-    run_ranges(_vote, len(places), channels, places, *step, *parts, voted, chunk=VOTE_PIXELS)
+        run_ranges(_vote_slanted, len(places), *parts, level.usable, number, support, warp, voted, chunk=VOTE_PIXELS)
     return voted
 
 
 @kernel
-def _vote(
-    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, slanted, number, support, warp, voted
-):  # fmt: skip
-    h, w, count = channels.shape
-    sums, one = np.empty(count), np.empty(count)
-    side = 2 * radius + 1
-    ends = 1 if dy == 0 and dx == 0 else 2
+def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
+    h, w, _ = channels.shape
+    count, differs = voted.shape[1], dy + dx > 0
+    sums = np.empty(count)
     for k in range(lo, hi):
         y, x = places[k]
         total = 0.0
         sums[:] = 0.0
         for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
             for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
-                if weights[a, b] == 0.0:
-                    continue
-                n, votes = number[a, b], True
+                weight = weights[a, b]
+                if weight > 0.0:
+                    v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                    total += weight
+                    if differs:
+                        for c in range(count):
+                            sums[c] += weight * (channels[v + dy, u + dx, c] - channels[v, u, c])
+                    else:
+                        for c in range(count):
+                            sums[c] += weight * channels[v, u, c]
+        if total > 0.0:
+            for c in range(count):
+                voted[k, c] = sums[c] / total
+
+
+@kernel
+def _vote_slanted(
+    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, number, support, warp, voted
+):  # fmt: skip
+    """Only pixels on the surface of a patch's centre; colours between four pixels of which all may be copied."""
+    h, w, _ = channels.shape
+    count, ends = voted.shape[1], 2 if dy + dx > 0 else 1
+    sums, one = np.empty(count), np.empty(count)
+    side = 2 * radius + 1
+    for k in range(lo, hi):
+        y, x = places[k]
+        total = 0.0
+        sums[:] = 0.0
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+                n, votes = number[a, b], weights[a, b] > 0.0
                 one[:] = 0.0
                 for end in range(ends):
                     i, j = y + end * dy - a, x + end * dx - b
-                    sign = 1.0 if end == ends - 1 else -1.0
-                    fv, fu = float(rows[a, b] + i), float(cols[a, b] + j)
-                    if slanted:
-                        fu = cols[a, b] + warp[n, 0] * j + warp[n, 1] * i
-                        fv = rows[a, b] + warp[n, 2] * j + warp[n, 3] * i
-                        if support[n, (i + radius) * side + j + radius] == 0:
-                            votes = False
+                    if not votes or support[n, (i + radius) * side + j + radius] == 0:
+                        votes = False
+                        break
+                    fu = cols[a, b] + warp[n, 0] * j + warp[n, 1] * i
+                    fv = rows[a, b] + warp[n, 2] * j + warp[n, 3] * i
                     if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
                         votes = False
-                    if not votes:
                         break
                     v, u = int(fv), int(fu)
                     v1, u1 = min(v + 1, h - 1), min(u + 1, w - 1)
-                    s, t = fv - v, fu - u
                     if not (usable[v, u] and usable[v, u1] and usable[v1, u] and usable[v1, u1]):
-                        if not usable[v, u] or slanted:
-                            votes = False
-                            break
+                        votes = False
+                        break
+                    s, t = fv - v, fu - u
+                    sign = 1.0 if end == ends - 1 else -1.0
                     for c in range(count):
-                        if slanted:
-                            top = (1 - t) * channels[v, u, c] + t * channels[v, u1, c]
-                            bottom = (1 - t) * channels[v1, u, c] + t * channels[v1, u1, c]
-                            one[c] += sign * ((1 - s) * top + s * bottom)
-                        else:
-                            one[c] += sign * channels[v, u, c]
+                        top = (1 - t) * channels[v, u, c] + t * channels[v, u1, c]
+                        bottom = (1 - t) * channels[v1, u, c] + t * channels[v1, u1, c]
+                        one[c] += sign * ((1 - s) * top + s * bottom)
                 if votes:
                     total += weights[a, b]
                     for c in range(count):
