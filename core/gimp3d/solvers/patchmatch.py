@@ -29,6 +29,7 @@ BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a 
 SMALLEST = 32  # px, no level is smaller
 NO_LOOKS, NO_SUPPORT = np.empty(0, np.float32), np.empty((0, 0), np.uint8)
 IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
+SAME = np.float32(255.0**-2 / 4)  # half a grey level: the tree is not asked for better, or plain areas lose coherence
 TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only decides between equal patches
 
 
@@ -294,6 +295,8 @@ def _sweep_band(
                         continue
                 elif scans > 0:
                     scans -= 1
+                    if own < SAME:
+                        continue
                     block = to_scan[scans] * 16
                     total = splat16(float32(0))
                     for k in range(16):
