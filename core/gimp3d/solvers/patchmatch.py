@@ -9,7 +9,7 @@ and pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -44,6 +44,7 @@ class PatchMatchSettings:
     grid: int = 2  # spacing of the sources that the tree holds; sweeps look at those between
     tree_sweeps: int = 2  # that look into the neighbours' leaves of the tree
     sweeps: int = 4  # per level, those among them
+    surface_sweeps: int = 3  # along a surface, after all others
     reach: int = 4  # of the random search round the best source
     seed: int = 0
 
@@ -69,6 +70,7 @@ def nearest_neighbour_field(
     source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
     penalty: np.ndarray | None = None,  # [H, W] float32 ≥ 0, added to the cost of each source
     settings: PatchMatchSettings = PatchMatchSettings(),
+    surface: Surface | None = None,  # what the picture shows
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most, found from the coarsest level to the finest.
 
@@ -76,6 +78,9 @@ def nearest_neighbour_field(
     difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
     scaled to [0, 1] (PixMix, Herling & Broll 2014). A source patch lies inside the image and holds no target
     pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
+
+    With a surface patches lie on its tangent planes, sources on other planes or of other orientations cost more, and
+    those seen more than twice as large or small are not taken (METHOD section 4) – unless there is no other.
     """
     radius = settings.patch // 2
     while radius > 0 and not (source & patch_centres(~target, radius)).any():
@@ -95,7 +100,19 @@ def nearest_neighbour_field(
         index = index_patches(patches, allowed, settings.grid) if allowed.any() and inside.any() else None
         field = refined(start, patches, inside, allowed, settings, extra, index)
     assert field is not None
-    return field
+    if surface is None or not field.found.any():
+        return field
+    patches = lay_out(levels[0][0], radius)
+    allowed = source & patch_centres(~target, radius)
+    reach = replace(settings, sweeps=settings.surface_sweeps, reach=max(target.shape) // 4)
+    along = refined(field, patches, target, allowed, reach, levels[0][3], surface=surface)
+    kept = along.cost < IMPOSSIBLE
+    rows, cols, cost = (np.where(kept, a, b) for a, b in zip(_arrays(along), _arrays(field)))
+    return NearestNeighbourField(rows, cols, cost, radius)
+
+
+def _arrays(field: NearestNeighbourField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return field.rows, field.cols, field.cost
 
 
 def patch_centres(

@@ -14,9 +14,10 @@ import numpy as np
 from numba import float32
 
 from ..jit import exact_kernel
-from ..threads import run_ranges
+from ..threads import parallel_map, run_ranges
 
 WINDOW = 14  # px: half the window that planes are fitted to
+STRIP = 256  # rows that are fitted at once; results do not depend on it
 LEAST_PIXELS = 0.25  # of the window that must be on a surface
 LEAST_COSINE = 0.08  # between a plane's normal and the ray; steeper planes are not believed
 ON_PLANE = 0.04  # relative difference of disparity up to which a pixel lies on another's plane
@@ -50,9 +51,22 @@ def tangent_planes(
     K: np.ndarray,  # [3, 3]
 ) -> Surface:
     """The plane round each pixel that fits best, from windows round it and beside it: edges do not tilt planes."""
-    h, w = disparity.shape
     valid = np.isfinite(disparity) & (disparity > 0)
     known = np.where(valid, disparity, 0.0).astype(np.float64)
+    far = SKY / max(float(known[valid].min(initial=1.0)), 1e-9)
+
+    def strip(top: int) -> list[np.ndarray]:
+        """Its rows see all that the whole picture's would: 2 windows to either side."""
+        first, last = max(0, top - 2 * WINDOW), min(len(known), top + STRIP + 2 * WINDOW)
+        moved = K - np.array([[0, 0, 0], [0, 0, first], [0, 0, 0]])
+        return [a[top - first : top - first + STRIP] for a in _planes(known[first:last], valid[first:last], moved, far)]
+
+    parts = parallel_map(strip, range(0, len(known), STRIP))
+    return Surface(*(np.concatenate(arrays) for arrays in zip(*parts)))
+
+
+def _planes(known: np.ndarray, valid: np.ndarray, K: np.ndarray, far: float) -> Surface:
+    h, w = known.shape
     plane = _fitted(known, valid)
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones((h, w))], -1)
@@ -63,7 +77,6 @@ def tangent_planes(
     cosine = (normal * rays).sum(-1) / np.linalg.norm(rays, axis=-1)
     flat = ~valid | (cosine < LEAST_COSINE) | (plane[..., 0] <= 0)
     normal[flat] = (0, 0, 1)
-    far = SKY / max(float(known[valid].min(initial=1.0)), 1e-9)
     depth = np.where(valid, 1 / np.maximum(np.where(flat, known, plane[..., 0]), 1e-12), far)
     plane[flat] = np.stack([known, np.zeros((h, w)), np.zeros((h, w))], -1)[flat]
     frame = _projected(normal, rays, depth, K)
@@ -72,13 +85,14 @@ def tangent_planes(
     point, normal, frame, inverse, plane = (
         np.ascontiguousarray(a, np.float32) for a in (rays * depth[..., None], normal, frame, inverse, plane)
     )
-    return Surface(point, normal, frame, inverse, plane, ~_beside_nearer(known))
+    return Surface(point, normal, frame, inverse, plane, ~_beside_nearer(known, plane))
 
 
-def _beside_nearer(disparity: np.ndarray) -> np.ndarray:
+def _beside_nearer(disparity: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """[H, W] bool: something close by is nearer than the pixel's own plane is there."""
     side = 2 * MIXED + 1
     nearest = cv2.dilate(disparity, np.ones((side, side), np.uint8))
-    return nearest > (1 + NEARER) * disparity
+    return nearest > (1 + NEARER) * (disparity + MIXED * np.abs(plane[..., 1:]).sum(-1))
 
 
 def _projected(normal: np.ndarray, rays: np.ndarray, depth: np.ndarray, K: np.ndarray) -> np.ndarray:
