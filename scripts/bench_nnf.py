@@ -57,7 +57,9 @@ def main() -> int:
         if options.quick:
             pictures = dict(list(pictures.items())[:2])
         for name, picture in pictures.items():
-            rows += list(measured("1080p" if large else "512", name, picture, 1 if large or options.quick else 3))
+            rows += list(
+                measured("1080p" if large else "512", name, picture, 1 if options.quick else 2 if large else 3)
+            )
             say(f"{rows[-1]['size']} {name} done")
     results = {"machine": machine(), "rows": rows}
     results["summary"] = [summary(rows, size) for size in dict.fromkeys(r["size"] for r in rows)]

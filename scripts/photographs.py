@@ -4,7 +4,9 @@ biharmonic fill, and PyPatchMatch, in an interpreter of their own (build/others)
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +54,9 @@ def photographs(others: Path, folder: Path, large: bool) -> dict[str, np.ndarray
     missing = [name for name in wanted if not (folder / f"{name}.png").exists()]
     if missing:
         folder.mkdir(parents=True, exist_ok=True)
-        subprocess.run([str(others), "-c", FETCH, str(folder), *missing], check=True)
+        done = run_in(others, FETCH, str(folder), *missing)
+        if done.returncode:
+            sys.exit(f"no photographs: {others} needs scikit-image and imageio ({last_line(done.stderr)})")
     size = (1920, 1080) if large else (512, 512)
     return {name: covering(read_image(folder / f"{name}.png"), *size) for name in wanted}
 
@@ -76,12 +80,22 @@ def blob(height: int, width: int, seed: int) -> np.ndarray:
     return away / outline <= np.quantile(away / outline, SHARE)
 
 
-def filled_by(others: Path, method: str, picture: np.ndarray, hole: np.ndarray, folder: Path) -> tuple:
-    """(filled picture, CPU seconds) of `biharmonic`, or of PyPatchMatch with this radius; None if it cannot be run."""
+def filled_by(others: Path, method: str, picture: np.ndarray, hole: np.ndarray, folder: Path) -> tuple[Any, Any]:
+    """(filled picture, CPU seconds) of `biharmonic`, or of PyPatchMatch with this radius; (None, why) if it fails."""
     write_png(folder / "picture.png", picture)
     write_png(folder / "hole.png", hole)
-    arguments = [method, str(folder), str(REPETITIONS), str(SLOW_S)]
-    done = subprocess.run([str(others), "-c", FILL, *arguments], capture_output=True, text=True, check=False)
+    done = run_in(others, FILL, method, str(folder), str(REPETITIONS), str(SLOW_S))
     if done.returncode:
-        return None, done.stderr.strip().splitlines()[-1]
+        return None, last_line(done.stderr)
     return np.where(hole[..., None], read_image(folder / "filled.png"), picture), float(done.stdout)
+
+
+def run_in(others: Path, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run([str(others), "-c", program, *arguments], capture_output=True, text=True, check=False)
+    except OSError as error:
+        return subprocess.CompletedProcess([], 1, "", f"{others}: {error.strerror}")
+
+
+def last_line(words: str) -> str:
+    return (words.strip().splitlines() or ["no message"])[-1]

@@ -249,7 +249,8 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Half the resolution; hole pixels do not mix into their neighbours."""
     size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
     known = (~hole).astype(np.float32)
-    parts = (channels * known[..., None])[..., :3], (channels * known[..., None])[..., 3:]  # OpenCV takes four at most
+    visible = channels * known[..., None]
+    parts = visible[..., :3], visible[..., 3:]  # OpenCV takes four channels at most
     total = np.dstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
     share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
     return total / np.maximum(share, 1e-6)[..., None], share < 0.5
