@@ -133,16 +133,27 @@ def _fitted(disparity: np.ndarray, valid: np.ndarray) -> np.ndarray:
     bx = np.where(fit, (vdx * vyy - vdy * vxy) / safe_determinant, 0)
     by = np.where(fit, (vdy * vxx - vdx * vxy) / safe_determinant, 0)
     residual = np.where(fit, np.maximum(vdd - bx * vdx - by * vdy, 0) / safe, np.inf)
-    best, least = np.stack([disparity, bx * 0, by * 0], -1), np.full((h, w), np.inf)
-    for oy in (0, -WINDOW, WINDOW):
-        for ox in (0, -WINDOW, WINDOW):
-            a, b = np.clip(np.arange(h) + oy, 0, h - 1)[:, None], np.clip(np.arange(w) + ox, 0, w - 1)
-            here = md[a, b] + bx[a, b] * (x - mx[a, b]) + by[a, b] * (y - my[a, b])
-            score = residual[a, b] + (disparity - here) ** 2
-            better = score < least
-            least[better] = score[better]
-            best[better] = np.stack([here, bx[a, b], by[a, b]], -1)[better]
-    return best
+    plane = np.empty((h, w, 3))
+    _choose(disparity, mx, my, md, bx, by, residual, plane)
+    return plane
+
+
+@exact_kernel
+def _choose(disparity, mx, my, md, bx, by, residual, plane):
+    """`plane` becomes that of the best window round or beside each pixel; where none fits, it is level."""
+    h, w = disparity.shape
+    for y in range(h):
+        for x in range(w):
+            least = np.inf
+            plane[y, x, 0], plane[y, x, 1], plane[y, x, 2] = disparity[y, x], 0.0, 0.0
+            for k in range(9):
+                a = min(max(y + (k // 3 - 1) * WINDOW, 0), h - 1)
+                b = min(max(x + (k % 3 - 1) * WINDOW, 0), w - 1)
+                here = md[a, b] + bx[a, b] * (x - mx[a, b]) + by[a, b] * (y - my[a, b])
+                score = residual[a, b] + (disparity[y, x] - here) ** 2
+                if score < least:
+                    least = score
+                    plane[y, x, 0], plane[y, x, 1], plane[y, x, 2] = here, bx[a, b], by[a, b]
 
 
 def coarser(surface: Surface, level: int, shape: tuple[int, ...]) -> Surface:
