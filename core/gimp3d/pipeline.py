@@ -104,7 +104,7 @@ class Picture:
     image: np.ndarray  # [H, W, 3] uint8, the view
     data: tuple[
         np.ndarray, ...
-    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,7 @@ def _fill_from_one_view(
                 "rules",
                 f"Filled view {p.camera_id}",
                 p.pasted(painted[p.camera_id]),
-                (p.rule_map(*painted[p.camera_id].shape[:2]),),
+                (p.rule_map(*painted[p.camera_id].shape[:2]), p.pasted(painted[p.camera_id], p.raw)),
             )
             for p in _spread(painting.views)
         ),
