@@ -213,7 +213,8 @@ def _page(
         f"{_flip_book(flips)}"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
         f"{_references(choices)}"
-        f"<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. {legend}</p><div class=grid>{stages}</div>"
+        f"<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. {legend}</p>"
+        f"<div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
     )
