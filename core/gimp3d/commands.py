@@ -355,6 +355,7 @@ def _summary(
             "gaussians_out": len(file.gaussians) - removed + added,
             "views": result.views,
             "hole_pixels": result.hole_pixels,
+            "open_pixels": result.open_pixels,
         },
         "selection": result.selection,
         "references": [asdict(choice) for choice in result.references],
