@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster extension screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
+	bench-harmonics extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -31,12 +32,28 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster
+bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
 	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
+
+bench-surface: $(READY)
+	$(BIN)/python scripts/bench_surface.py $(DATA)
+
+bench-poisson: $(READY)
+	$(BIN)/python scripts/bench_poisson.py
+
+bench-depth: $(READY)
+	$(BIN)/python scripts/bench_depth.py --data $(DATA)
+
+bench-propagate: $(READY)
+	$(BIN)/python scripts/bench_propagate.py $(DATA)
+
+# with DATA, also what the fit brings to removals: ten minutes more
+bench-harmonics: $(READY)
+	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

@@ -30,7 +30,7 @@ from unittest import mock
 import llvmlite.binding
 import numba
 import numpy as np
-from raster_chart import in_words
+from chart import in_words
 from raster_report import draw_chart, markdown, shown
 
 from gimp3d.camera import Camera

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from raster_chart import Series, in_words, speed_chart
+from chart import Series, in_words
+from raster_chart import speed_chart
 
 
 def markdown(results: dict[str, Any]) -> str:

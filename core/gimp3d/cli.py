@@ -23,6 +23,8 @@ from .errors import BadInput, Cancelled, Gimp3dError
 from .job import RemovalJob, load_job, save_job
 
 Namespace = argparse.Namespace
+DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
+EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -59,6 +61,11 @@ def build_parser() -> argparse.ArgumentParser:
     masks.add_argument("--roi", required=True)
     masks.add_argument("--out", required=True, metavar="DIR")
     masks.add_argument("--mode", choices=("need", "paper"), default="need")
+    masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
+    masks.add_argument(
+        "--pictures", metavar="DIR", help="also draw the region over each view, and the surface that would be completed"
+    )
+    masks.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
     masks.add_argument("--split", choices=("train", "test", "all"), default="train")
     masks.add_argument("--frames", metavar="ID,ID", help="only these cameras are written")
     _running(masks)
@@ -69,6 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--roi")
     remove.add_argument("--out", metavar="OUT.ply")
     remove.add_argument("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
+    remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
     remove.add_argument("--reference", metavar="ID", help="the view to complete first (default: chosen)")
     remove.add_argument("--reference-image", metavar="FILE", help="that view without the object")
     remove.add_argument(
@@ -77,7 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="PROVIDER",
         help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD",
     )
-    remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help="auto|harmonic|planar|file:PATH")
+    remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
     remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
     remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
     remove.add_argument("--views-out", metavar="DIR", help="write every completed view")
@@ -224,6 +232,9 @@ def _masks(given: Namespace, shown: Reporter) -> None:
         mode=given.mode,
         split=given.split,
         frames=_names(given.frames),
+        extra_masks=Path(given.extra_masks) if given.extra_masks else None,
+        pictures=Path(given.pictures) if given.pictures else None,
+        depth_prior=given.depth_prior,
         threads=given.threads,
         progress=shown,
     )

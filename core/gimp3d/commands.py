@@ -6,7 +6,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,16 @@ from .box import read_region
 from .camera import Camera
 from .errors import BadInput
 from .io.cameras import read_cameras, write_transforms
+from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
-from .io.ply import SplatFile, read_ply, write_gaussians, write_ply
+from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
 from .orbit import orbit_cameras
-from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, remove_object, render_bytes
+from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .report import write_removal_report
+from .report import draw, write_removal_report
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -36,7 +37,7 @@ PASSES = ("rgb", "alpha", "depth", "normal")
 
 def scene_info(path: Path) -> dict[str, Any]:
     """Facts about a scene file: kind, count, SH degree, extent, unusable rows."""
-    file = read_ply(path)
+    file = read_scene(path)
     g = file.gaussians
     usable = g.usable
     means = g.means[usable] if usable.any() else np.zeros((1, 3), np.float32)
@@ -56,10 +57,10 @@ def scene_info(path: Path) -> dict[str, Any]:
 
 
 def convert(source: Path, target: Path) -> None:
-    """Write a scene as a plain binary PLY in Inria's layout."""
+    """Write a scene of any kind that `read_scene` knows as a plain binary PLY in Inria's layout."""
     if target.suffix.lower() != ".ply":
         raise BadInput(f"convert: {target} must end in .ply")
-    write_gaussians(target, read_ply(source).gaussians)
+    write_gaussians(target, read_scene(source).gaussians)
 
 
 def select_cameras(
@@ -105,7 +106,7 @@ def render_views(
         raise BadInput(f"render: --scale must be in (0, 16], got {scale}")
     if not all(0 <= b <= 1 for b in background):
         raise BadInput("render: --background takes three numbers from 0 to 1")
-    gaussians = read_ply(scene).gaussians
+    gaussians = read_scene(scene).gaussians
     chosen = select_cameras(read_cameras(cameras), split, frames)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
@@ -131,23 +132,48 @@ def write_masks(
     mode: str = "need",
     split: str = "train",
     frames: Sequence[str] | None = None,
+    extra_masks: Path | None = None,
+    pictures: Path | None = None,
+    depth_prior: str = "auto",
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
-    """Write every view's target region as a 0/255 picture (CONTRACT: masks)."""
+    """Write every view's target region as a 0/255 picture (CONTRACT: masks).
+
+    With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
+    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one.
+    """
     _use_threads(threads)
-    gaussians, region = read_ply(scene).gaussians, read_region(roi)
+    gaussians, region = read_scene(scene).gaussians, read_region(roi)
     available = read_cameras(cameras)
-    written = [undistorted(c) for c in select_cameras(available, split, frames)]
+    written = select_cameras(available, split, frames)
     names = {c.id for c in written}
-    others = [undistorted(c) for c in available if c.split == "train" and c.id not in names]
+    looked_at = [*written, *(c for c in available if c.split == "train" and c.id not in names)]
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    found = find_masks(gaussians, region, [*written, *others], MaskSettings(mode=mode), progress)
-    targets = {v.camera.id: v.target for v in found.views}
+    with_photo = [c for c in looked_at if c.split == "train" and c.image is not None and c.image.exists()]
+    photos = dict(zip((c.id for c in with_photo), parallel_map(lambda c: load_view(c)[0], with_photo)))
+    found = find_masks(
+        gaussians,
+        region,
+        [undistorted(c) for c in looked_at],
+        MaskSettings(mode=mode),
+        progress,
+        photos,
+        _read_extra_masks(extra_masks, looked_at),
+    )
+    views = {v.camera.id: v for v in found.views}
+    settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
     for camera in written:
+        view = views.get(camera.id)
         empty = np.zeros((camera.height, camera.width), bool)
         target = out / output_name(camera.id)
-        write_png(target.with_name(target.name + ".png"), targets.get(camera.id, empty))
+        write_png(target.with_name(target.name + ".png"), view.target if view else empty)
+        if pictures and view:
+            picture = photos.get(camera.id)
+            shown = render_bytes(gaussians, view.camera) if picture is None else picture
+            target = pictures / output_name(camera.id)
+            for drawn in preview(view, found.views, shown, settings):
+                write_png(target.with_name(f"{target.name}.{drawn.kind}.png"), draw(drawn))
 
 
 def write_orbit(
@@ -161,7 +187,7 @@ def write_orbit(
     fov_degrees: float = 50.0,
 ) -> None:
     """Write cameras round a region, for a scene that has none (CONTRACT: orbit)."""
-    read_ply(scene)  # a wrong file should be refused now, not when the cameras are used
+    read_scene(scene)  # a wrong file should be refused now, not when the cameras are used
     cameras = orbit_cameras(read_region(roi), views, tuple(up), width, height, fov_degrees)  # type: ignore[arg-type]
     write_transforms(out, cameras)
 
@@ -179,7 +205,7 @@ def run_removal(
     if out.suffix.lower() != ".ply":
         raise BadInput(f"--out: {out} must end in .ply")
     progress("read", 0, 1, job.scene)
-    file = read_ply(Path(job.scene))
+    file = read_scene(Path(job.scene))
     region = read_region(Path(job.roi))
     cameras = _removal_cameras(job)
     warnings = list(_scene_warnings(file))
@@ -188,9 +214,12 @@ def run_removal(
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     given = read_image(Path(job.reference_image)) if job.reference_image else None
+    extra = _read_extra_masks(Path(job.extra_masks) if job.extra_masks else None, cameras)
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
-    store = StageStore(folder / "stages", _job_key(job, views), STORED, resume) if folder else None
-    result = remove_object(file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store)
+    store = StageStore(folder / "stages", _job_key(job, views, extra), STORED, resume) if folder else None
+    result = remove_object(
+        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store, extra
+    )
     write_ply(out, file, result.keep, result.added)
     if job.views_out:
         for name, image in result.painted.items():
@@ -278,6 +307,17 @@ def _load_views(cameras: Sequence[Camera], job: RemovalJob, file: SplatFile) -> 
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
 
 
+def _read_extra_masks(folder: Path | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """The masks of a folder by camera ID, undistorted and resampled like photos; views may lack one."""
+    if folder is None:
+        return {}
+    paths = {c.id: folder / f"{output_name(c.id)}.png" for c in cameras}
+    masks = {c.id: load_view(replace(c, image=paths[c.id]))[0].max(-1) > 127 for c in cameras if paths[c.id].is_file()}
+    if not masks:
+        raise BadInput(f"--extra-masks: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
+    return masks
+
+
 def _scene_warnings(file: SplatFile) -> list[str]:
     unusable = int((~file.gaussians.usable).sum())
     found = []
@@ -310,6 +350,7 @@ def _summary(
             "views": result.views,
             "hole_pixels": result.hole_pixels,
         },
+        "selection": result.selection,
         "references": [asdict(choice) for choice in result.references],
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],
@@ -327,12 +368,12 @@ def peak_memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _job_key(job: RemovalJob, views: Sequence[View]) -> str:
+def _job_key(job: RemovalJob, views: Sequence[View], extra: Mapping[str, np.ndarray]) -> str:
     """A hash of everything that a stage's result depends on."""
     digest = hashlib.sha256(__version__.encode())
     free = ("out", "views_out", "report", "summary", "threads", "device")
     files = ("scene", "cameras", "roi", "reference_image")
-    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, "images")}
+    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks")}
     digest.update(json.dumps(settings, sort_keys=True).encode())
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
@@ -340,6 +381,8 @@ def _job_key(job: RemovalJob, views: Sequence[View]) -> str:
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
         digest.update(view.image.tobytes())
+        if view.camera.id in extra:
+            digest.update(extra[view.camera.id].tobytes())
     return digest.hexdigest()
 
 

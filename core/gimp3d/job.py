@@ -30,6 +30,7 @@ class RemovalJob:
     roi: str
     out: str
     images: str | None = None  # folder; "none": views are rendered from the scene itself
+    extra_masks: str | None = None  # folder of masks that are filled too: shadows, reflections
     reference: str | None = None
     reference_image: str | None = None
     inpaint: str = "exemplar"
@@ -43,7 +44,10 @@ class RemovalJob:
     threads: int | None = None
     seed: int = 0
 
-    PATHS = ("scene", "cameras", "roi", "out", "images", "reference_image", "views_out", "report", "summary")
+    PATHS = (
+        *("scene", "cameras", "roi", "out", "images", "extra_masks"),
+        *("reference_image", "views_out", "report", "summary"),
+    )
 
     def resolved(self, folder: Path) -> RemovalJob:
         """The same job with its relative paths made absolute against `folder`."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -17,7 +18,9 @@ from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
-from .stages.depth import DepthCompletion, DepthSettings, complete_disparity
+from .solvers.harmonics import HarmonicsSettings
+from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from .stages.propagate import (
@@ -40,6 +43,7 @@ from .stages.reference import (
     rim,
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
 R = TypeVar("R")
@@ -69,10 +73,10 @@ PRESETS: dict[str, RemovalSettings] = {
     "balanced": RemovalSettings(),
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
-        masks=MaskSettings(mode="paper", support=0.0),
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_jump=1e9),
-        propagate=PropagateSettings(transfer="sample"),
-        seed=SeedSettings(sh_degree=3, ridge=1e-3),
+        masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        propagate=PropagateSettings(transfer="sample", blend="rim"),
+        seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         use_evidence=False,
         extra_references=0,
     ),
@@ -93,10 +97,12 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | depth | appearance | mapping | rules
+    kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    data: tuple[np.ndarray, ...]  # per kind: (target) | (depth, target) | (target) | (rows, cols) | (rules)
+    data: tuple[
+        np.ndarray, ...
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,7 @@ class RemovalResult:
     pictures: tuple[Picture, ...] = ()
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
+    selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
 
 
 class Store(Protocol):
@@ -163,6 +170,7 @@ def remove_object(
     reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
     progress: Progress = silent,
     store: Store | None = None,
+    extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
 
@@ -183,9 +191,11 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
-    masks = run("masks", lambda: find_masks(scene, region, [v.camera for v in views], settings.masks, progress))
-    keep = ~masks.removed
     photos = {v.camera.id: v.image for v in views}
+    cameras = [v.camera for v in views]
+    masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
+    run.warnings += masks.warnings
+    keep = ~masks.removed
     for v in _spread(masks.views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if not masks.removed.any():
@@ -193,7 +203,10 @@ def remove_object(
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
     if masks.hole_pixels == 0:
-        return _finish(run, keep, None, masks, {}, ["nothing to fill: every view sees what is behind the object"])
+        why = "nothing to fill: every view sees what is behind the object"
+        if masks.mode == "paper":
+            why = "nothing to fill: what surrounds the box covers its outline in every view"
+        return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
     painted = {
         v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
@@ -224,8 +237,8 @@ def remove_object(
             break
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
-        painted.update({p.camera_id: p.image for p in painting.views})
-        rules = {p.camera_id: p.rules for p in painting.views}
+        painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
+        rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         open_views = _all_still_open(open_views, filled, len(added), rules)
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
@@ -251,7 +264,10 @@ def _fill_from_one_view(
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
-    completed: DepthCompletion = run(f"depth{suffix}", lambda: _complete_depth(view, settings))
+    completed: DepthCompletion = run(
+        f"depth{suffix}",
+        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given, first=not suffix),
+    )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
@@ -261,18 +277,13 @@ def _fill_from_one_view(
     if len(seeds) == 0:
         raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)
-    to_paint = parallel_map(
-        lambda v: ViewToPaint(
-            v.camera,
-            photos[v.camera.id],
-            painted[v.camera.id],
-            v.silhouette,
-            v.target,
-            v.depth_before,
-            surface_depth(with_seeds, v.camera)[0],
-        ),
-        open_views,
-    )
+
+    def to_paint(v: ViewMasks) -> ViewToPaint:
+        name = v.camera.id
+        depth_new = surface_depth(with_seeds, v.camera)[0]
+        return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
+
+    loaders = [partial(to_paint, v) for v in open_views]
     source = ~view.target & ~view.silhouette & (depth > 0)
     field_: MappingField = run(
         f"mapping{suffix}",
@@ -290,21 +301,30 @@ def _fill_from_one_view(
             settings.random_seed,
         ),
     )
-    reference = Reference(view.camera, appearance.image, depth, view.target, field_.rows, field_.cols)
+    reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
     painting: Propagation = run(
-        f"propagate{suffix}", lambda: propagate(reference, to_paint, settings.propagate, run.progress)
+        f"propagate{suffix}", lambda: propagate(reference, loaders, settings.propagate, run.progress)
     )
     painting = _with_reference(painting, view, appearance)
     name = view.camera.id
     run.pictures += [
         Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
+        *_fit_picture(completed, appearance.image, name),
         Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
         Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
-        *(Picture("rules", f"Filled view {p.camera_id}", p.image, (p.rules,)) for p in _spread(painting.views)),
+        *(
+            Picture(
+                "rules",
+                f"Filled view {p.camera_id}",
+                p.pasted(painted[p.camera_id]),
+                (p.rule_map(*painted[p.camera_id].shape[:2]),),
+            )
+            for p in _spread(painting.views)
+        ),
     ]
     new: Gaussians = run(
         f"seed{suffix}",
-        lambda: colour_gaussians(seeds, view.camera, to_paint, painting.views, filled.sh_degree, settings.seed),
+        lambda: colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
@@ -313,17 +333,58 @@ def _fill_from_one_view(
 def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearance) -> Propagation:
     """The reference itself shows its own completed picture, not a mapped one."""
     rules = np.where(view.target, Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    own = PaintedView(view.camera.id, appearance.image, appearance.image, rules)
+    own = PaintedView(view.camera.id, 0, 0, appearance.image, appearance.image, rules)
     return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
 
 
-def _complete_depth(view: ViewMasks, settings: RemovalSettings) -> DepthCompletion:
-    prior = depth_prior(settings.depth_prior, view.camera.height, view.camera.width)
-    surface = settings.depth_prior if settings.depth_prior in ("harmonic", "planar") else settings.depth.surface
+def _complete_depth(
+    view: ViewMasks,
+    open_views: Sequence[ViewMasks],
+    base: np.ndarray,
+    settings: RemovalSettings,
+    given: np.ndarray | None,
+    first: bool = True,  # reference; a file's prior is of that view
+) -> DepthCompletion:
+    """The reference's depth; a model that estimates it looks at the picture given, or at a first fill."""
+    picture, spec = None, settings.depth_prior
+    if spec.startswith("file:") and not first:
+        spec = "auto"
+    if spec.startswith("onnx:"):
+        if given is not None:
+            picture = paste_picture(base, view.target, given, "--reference-image").image
+        else:
+            picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
+    prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
+    surface = spec if spec in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
-    return complete_disparity(
-        disparity_of(view.depth_after), known, view.target, prior, replace(settings.depth, surface=surface)
+    return complete_depth(
+        view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)
     )
+
+
+def preview(
+    view: ViewMasks, views: Sequence[ViewMasks], picture: np.ndarray, settings: RemovalSettings = RemovalSettings()
+) -> tuple[Picture, ...]:
+    """What a removal would do in a view: where it would fill, on what surface, and how a depth prior was scaled."""
+    name = view.camera.id
+    shown = [Picture("mask", f"Region to fill in {name}", picture, (view.target,))]
+    if view.target.any():
+        try:
+            completed = _complete_depth(view, views, picture, settings, None)
+        except IllPosed:
+            return tuple(shown)  # the region is worth seeing all the more
+        depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
+        shown.append(Picture("depth", f"Completed surface in {name}", picture, (depth, view.target)))
+        shown += _fit_picture(completed, picture, name)
+    return tuple(shown)
+
+
+def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
+    """How the depth prior was scaled, if there was one."""
+    if len(completed.gradients) == 0:
+        return []
+    data = (completed.gradients, np.array([completed.scale_factor]))
+    return [Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data)]
 
 
 def _appearance(
@@ -340,7 +401,8 @@ def _appearance(
         return paste_picture(base, view.target, given, "--reference-image")
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
-        sources = [(v.camera, photos[v.camera.id], v.depth_before) for v in open_views]
+        # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
+        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
@@ -407,6 +469,7 @@ def _finish(
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
+        selection=masks.selection.counts,
     )
 
 
@@ -415,6 +478,7 @@ STORED = (
     Camera,
     Gaussians,
     Masks,
+    Selection,
     ViewMasks,
     ReferenceChoice,
     ViewScore,

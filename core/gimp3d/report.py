@@ -21,6 +21,8 @@ from .stages.reference import ReferenceChoice
 RULE_COLOURS = {
     Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
     Rule.OWN_PIXELS: ("this view's own pixels, mapped", (70, 120, 220)),
+    Rule.RETARGETED: ("this view's own pixels, found near the mapped ones", (60, 190, 220)),
+    Rule.OTHER_VIEW: ("the mapped source as another view shows it", (160, 90, 200)),
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
@@ -71,6 +73,8 @@ def draw(picture: Picture) -> np.ndarray:
         return tinted(picture.image, picture.data[0], (230, 60, 60))
     if picture.kind == "depth":
         return relief(picture.data[0], picture.data[1])
+    if picture.kind == "fit":
+        return fit_plot(picture.data[0], picture.data[1])
     if picture.kind == "mapping":
         return offset_colours(picture.image, *picture.data)
     if picture.kind == "rules":
@@ -116,6 +120,38 @@ def relief(
     return outlined(shaded, mask)
 
 
+def fit_plot(
+    gradients: np.ndarray,  # [N, 2] (prior's, scene's) differences of disparity on the ring round the hole
+    scale: np.ndarray,  # s_f, one number; 0 = the prior is not used
+    size: int = 480,  # px
+) -> np.ndarray:
+    """How s_f was measured: the scene's gradients over the prior's, and the line fitted; [size, size, 3] uint8."""
+    ink, faint, dots, line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
+    font, low, high = cv2.FONT_HERSHEY_SIMPLEX, 56, size - 56
+    drawn = np.full((size, size, 3), 255, np.uint8)
+    reach = np.maximum(np.percentile(np.abs(gradients), 99, axis=0), 1e-9) * 1.05  # outliers stay outside
+    middle, half = (low + high) / 2, (high - low) / 2
+    for share in (-1, -0.5, 0, 0.5, 1):
+        at = round(middle + share * half)
+        cv2.line(drawn, (at, low), (at, high), faint, 1)
+        cv2.line(drawn, (low, at), (high, at), faint, 1)
+        cv2.putText(drawn, f"{share * reach[0]:.2g}", (at - 20, high + 20), font, 0.38, ink, 1, cv2.LINE_AA)
+        cv2.putText(drawn, f"{-share * reach[1]:.2g}", (6, at + 4), font, 0.38, ink, 1, cv2.LINE_AA)
+    places = middle + gradients / reach * [half, -half]
+    inside = (np.abs(gradients) <= reach).all(1)
+    for x, y in np.rint(places[inside]).astype(int):
+        cv2.circle(drawn, (int(x), int(y)), 1, dots, -1, cv2.LINE_AA)
+    rise = float(scale.ravel()[0]) * reach[0] / reach[1] * half
+    ends = [(round(middle - half), round(middle + rise)), (round(middle + half), round(middle - rise))]
+    _, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), *ends)
+    cv2.line(drawn, start, end, line, 2, cv2.LINE_AA)
+    words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
+    cv2.putText(drawn, words, (low, 36), font, 0.65, line, 2, cv2.LINE_AA)
+    cv2.putText(drawn, "gradient of the prior", (size // 2 - 72, size - 12), font, 0.45, ink, 1, cv2.LINE_AA)
+    cv2.putText(drawn, "gradient of the scene", (size - 204, 36), font, 0.45, ink, 1, cv2.LINE_AA)
+    return drawn
+
+
 def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
     """Offsets of a mapping field: hue is the direction, brightness the length."""
     y, x = np.mgrid[: rows.shape[0], : rows.shape[1]]
@@ -156,7 +192,10 @@ def _page(
     )
     warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
     settings = text(json.dumps(summary["settings"], indent=1))
-    numbers = "".join(f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>" for k, v in counts.items())
+    numbers = "".join(
+        f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>"
+        for k, v in (counts | summary.get("selection", {})).items()
+    )
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
         f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"

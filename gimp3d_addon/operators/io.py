@@ -10,7 +10,8 @@ from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
 from gimp3d.errors import BadInput
-from gimp3d.io.ply import read_ply, write_ply
+from gimp3d.io.formats import read_scene
+from gimp3d.io.ply import write_ply
 
 from .. import splats
 from .base import ReportsErrors, current_splat, link
@@ -26,16 +27,16 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
     """Import a Gaussian splat scene; its numbers are kept exactly"""
 
     bl_idname = "gimp3d.import_ply"
-    bl_label = "Import Splat PLY"
+    bl_label = "Import Splats"
     bl_options = {"REGISTER", "UNDO"}
     filename_ext = ".ply"
 
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: StringProperty(default="*.ply;*.splat;*.spz;*.sog;meta.json", options={"HIDDEN"})
     up: EnumProperty(items=UP_ITEMS, name="Up", default="FILE", description="Goes into the object's matrix only")
 
     def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
-        file = read_ply(path)
+        file = read_scene(path)
         if file.table.before or file.table.after:
             self.report({"WARNING"}, "elements other than vertex are not kept")
         obj = splats.create_object(splats.default_name(path), file, splats.UP_AXES[self.up])

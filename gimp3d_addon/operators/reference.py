@@ -93,8 +93,11 @@ class GIMP3D_OT_render_view(ReportsErrors, bpy.types.Operator):
             _picture(Path(name, "view.png"), "3D-GIMP view")
 
 
+PREVIEWS = {"mask": "3D-GIMP hole", "depth": "3D-GIMP surface", "fit": "3D-GIMP depth prior"}
+
+
 class GIMP3D_OT_preview_masks(ReportsErrors, bpy.types.Operator):
-    """Show what will be filled in the reference (or active) camera, as the image '3D-GIMP mask'"""
+    """Show what will be filled in the reference (or active) camera and on what surface, as images '3D-GIMP …'"""
 
     bl_idname = "gimp3d.preview_masks"
     bl_label = "Preview Mask"
@@ -105,16 +108,22 @@ class GIMP3D_OT_preview_masks(ReportsErrors, bpy.types.Operator):
         return current_splat(context) is not None and bool(current_boxes(context))
 
     def work(self, context: bpy.types.Context) -> None:
-        with _passing_folder() as folder:
-            job, name = _prepared(context, Path(folder))
-            _picture(_mask(context, Path(folder), job, name), "3D-GIMP mask")
+        with _passing_folder() as name:
+            folder = Path(name)
+            job, camera = _prepared(context, folder)
+            pictures = folder / "pictures"
+            _picture(_mask(context, folder, job, camera, "--pictures", str(pictures)), "3D-GIMP mask")
+            for kind, title in PREVIEWS.items():
+                drawn = pictures / f"{_stem(camera)}.{kind}.png"
+                if drawn.exists():
+                    _picture(drawn, title)
 
 
-def _mask(context: bpy.types.Context, folder: Path, job: RemovalJob, name: str) -> Path:
+def _mask(context: bpy.types.Context, folder: Path, job: RemovalJob, name: str, *more: str) -> Path:
     mode = "paper" if job.preset == "paper" else "need"
     _run(
         context, "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
-        "--frames", name, "--mode", mode,
+        "--frames", name, "--mode", mode, "--depth-prior", job.depth_prior, *more,
     )  # fmt: skip
     return folder / "masks" / f"{_stem(name)}.png"
 

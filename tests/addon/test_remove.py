@@ -122,6 +122,9 @@ def test_pictures_of_a_view_the_mask_and_the_reference(folder: Path) -> None:
     assert bpy.ops.gimp3d.preview_masks() == {"FINISHED"}
     pixels = np.array(bpy.data.images["3D-GIMP mask"].pixels).reshape(90, 120, 4)
     assert 0.005 < pixels[..., 0].mean() < 0.5
+    for name in ("3D-GIMP hole", "3D-GIMP surface"):
+        assert bpy.data.images[name].size[:] == (120, 90)
+    assert "3D-GIMP depth prior" not in bpy.data.images
     assert bpy.ops.gimp3d.export_reference(filepath=str(folder / "ref.png")) == {"FINISHED"}
     assert (folder / "ref.mask.png").is_file()
     assert bpy.ops.gimp3d.load_reference(filepath=str(folder / "ref.png")) == {"FINISHED"}

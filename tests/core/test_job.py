@@ -22,12 +22,14 @@ def test_paths_inside_the_folder_move_with_it(tmp_path: Path) -> None:
         roi=str(tmp_path / "job" / "roi.json"),
         out=str(tmp_path / "job" / "out.ply"),
         images=str(outside),
+        extra_masks=str(tmp_path / "job" / "shadows"),
         set={"seed.opacity": "0.9"},
     )
     save_job(tmp_path / "job", job)
     (tmp_path / "job").rename(tmp_path / "moved")
     loaded = load_job(tmp_path / "moved")
     assert loaded.scene == str(tmp_path / "moved" / "scene.ply") and loaded.images == str(outside)
+    assert loaded.extra_masks == str(tmp_path / "moved" / "shadows")
     assert loaded.set == {"seed.opacity": "0.9"} and loaded.report is None
 
 

@@ -61,3 +61,20 @@ def test_every_kind_of_picture_is_drawn(picture: Picture) -> None:
     assert drawn.dtype == np.uint8 and drawn.shape[0] == 20 and drawn.shape[2] == 3
     if picture.data[0].any() and picture.kind != "depth":
         assert (drawn[:, :30] != IMAGE).any() or (drawn[:, 30:] != IMAGE).any()
+
+
+@pytest.mark.parametrize("scale", [0.4, 3.0, 0.0])
+def test_the_fit_of_a_prior_is_drawn_with_its_line(scale: float) -> None:
+    prior = np.random.default_rng(0).normal(size=(800, 1))
+    noise = 0.1 * np.random.default_rng(1).normal(size=(800, 1))
+    drawn = draw(Picture("fit", "", IMAGE, (np.hstack([prior, scale * prior + noise]), np.array([scale]))))
+    assert drawn.shape == (480, 480, 3)
+    line = (drawn[60:420, 60:420] == (198, 81, 2)).all(-1)
+    rows, cols = np.nonzero(line)
+    slope = np.polyfit(cols, rows, 1)[0]
+    assert len(rows) > 300 and (slope < -0.5 if scale else abs(slope) < 0.02)
+    assert (drawn == (94, 85, 163)).all(-1).sum() > 600  # a dot per pair, none hidden but by others and the line
+
+
+def test_a_fit_of_a_constant_prior_is_drawn() -> None:
+    draw(Picture("fit", "", IMAGE, (np.zeros((40, 2)), np.array([0.0]))))

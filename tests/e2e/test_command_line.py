@@ -139,6 +139,37 @@ def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -
     assert (read_image(tmp_path / "views" / f"{reference.id}.png").shape) == (90, 120, 3)
 
 
+def test_extra_masks_are_filled_too(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera = cameras()[4]
+    shadow = np.zeros((camera.height, camera.width), bool)
+    shadow[70:80, 20:40] = True  # floor beside the block
+    write_png(tmp_path / "extra" / f"{output_name(camera.id)}.png", shadow)
+    extra = ["--extra-masks", str(tmp_path / "extra")]
+    remove(
+        scene_folder,
+        tmp_path / "out.ply",
+        *extra,
+        "--summary",
+        str(tmp_path / "s.json"),
+        "--job",
+        str(tmp_path / "job"),
+    )
+    selection = json.loads((tmp_path / "s.json").read_text())["selection"]
+    assert selection["removed_inside"] > 1000 and selection["removed_masked"] > 0
+    assert read_ply(tmp_path / "out.ply").gaussians.means.shape[0] > 0
+    scene_options = [str(scene_folder / "scene.ply"), "--cameras", str(scene_folder / "transforms.json")]
+    region = ["--roi", str(scene_folder / "roi.json"), "--progress", "none"]
+    assert main(["masks", *scene_options, *region, "--out", str(tmp_path / "masks"), *extra]) == 0
+    drawn = read_image(tmp_path / "masks" / f"{output_name(camera.id)}.png").max(-1) > 0
+    assert drawn[shadow].all() and not drawn.all()
+    (tmp_path / "empty").mkdir()
+    assert (
+        main(["masks", *scene_options, *region, "--out", str(tmp_path / "m"), "--extra-masks", str(tmp_path / "empty")])
+        == 2
+    )
+    assert "--extra-masks" in capsys.readouterr().err and not (tmp_path / "m").exists()
+
+
 @pytest.mark.parametrize("preset", ["draft", "balanced", "best", "paper"])
 def test_every_preset_runs_and_its_summary_is_strict_json(preset: str, scene_folder: Path, tmp_path: Path) -> None:
     remove(scene_folder, tmp_path / "out.ply", "--preset", preset, "--summary", str(tmp_path / "s.json"))
@@ -191,6 +222,9 @@ def test_render_masks_orbit_evaluate_and_info(
         )
         mask = read_image(tmp_path / mode / "orbit" / "000.png")
         assert set(np.unique(mask)) == {0, 255}
+    shown = ["masks", scene_, "--cameras", cams, "--roi", roi, "--out", str(tmp_path / "need"), "--frames", "orbit/000"]
+    assert main([*shown, "--pictures", str(tmp_path / "shown"), *quiet]) == 0
+    assert {p.name for p in (tmp_path / "shown" / "orbit").iterdir()} == {"000.mask.png", "000.depth.png"}
     assert (
         main(
             [

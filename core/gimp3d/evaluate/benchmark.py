@@ -22,7 +22,7 @@ from ..io.images import read_image, read_mask, write_png
 from ..io.ply import read_ply, write_ply
 from ..job import RemovalJob
 from ..progress import Progress, silent
-from ..stages.masks import select_removed
+from ..stages.selection import select_removed
 from .metrics import evaluate_folders
 
 MASKS = {"mask": ".mask.png", "unseen": ".unseen.png"}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,7 +103,12 @@ def write_ply(
     ]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
     kept = table.rows[np.asarray(keep, dtype=bool)]
-    new = new_rows(table, added) if added is not None and len(added) else None
+    new = None
+    if added is not None and len(added):
+        new = new_rows(table, added)
+        for name in new.dtype.names or ():
+            if not np.isfinite(new[name]).all():
+                raise ValueError(f"a new Gaussian has a {name} that is not finite")
 
     def write(f):  # type: ignore[no-untyped-def]
         f.write(header)
@@ -122,6 +127,12 @@ def write_ply(
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
     """Write a fresh binary PLY in Inria's layout."""
+    file = file_of(gaussians, comments)
+    write_ply(path, file, np.ones(len(gaussians), bool))
+
+
+def file_of(gaussians: Gaussians, comments: Sequence[str] = ()) -> SplatFile:
+    """The Gaussians as a binary PLY in Inria's layout, as if it had been read."""
     bands = gaussians.sh.shape[1]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{k}" for k in range(3 * (bands - 1))] + ["opacity"]
@@ -136,13 +147,30 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, comments: Sequence[s
     header += [f"property float {n}" for n in names]
     properties = tuple(PlyProperty(n, "float") for n in names)
     table = PlyTable(tuple(header), "\n", "binary_little_endian", properties, np.zeros(0, f"V{4 * len(names)}"))
-    write_ply(path, SplatFile(gaussians.take(np.zeros(0, int)), table), np.zeros(0, bool), gaussians)
+    rows = new_rows(table, gaussians).view(f"V{4 * len(names)}")
+    return SplatFile(gaussians, replace(table, rows=rows))
 
 
-def read_table(path: Path) -> PlyTable:
-    """Read a PLY's header and vertex rows without interpreting them."""
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a PLY announces."""
+
+    lines: tuple[str, ...]  # without line ends and `end_header`
+    line_end: str
+    format: str
+    elements: tuple[PlyElement, ...]
+    size: int  # bytes up to the body
+
+
+def header_of(path: Path) -> PlyHeader:
+    """Read a PLY's header.
+
+    Raises
+    ------
+    BadInput
+        If the file cannot be read or its header is damaged.
+    """
     try:
-        size = path.stat().st_size
         with path.open("rb") as f:
             start = f.read(MAX_HEADER)
     except OSError as error:
@@ -153,11 +181,18 @@ def read_table(path: Path) -> PlyTable:
     if not end:
         raise BadInput(f"{path}: the PLY header has no end_header; the file is damaged")
     line_end = "\r\n" if start[3:4] == b"\r" else "\n"
-    header = [line.rstrip("\r") for line in start[: end.start()].decode("latin-1").split("\n")[:-1]]
-    form, elements = _parse_header(path, header)
+    lines = [line.rstrip("\r") for line in start[: end.start()].decode("latin-1").split("\n")[:-1]]
+    form, elements = _parse_header(path, lines)
+    return PlyHeader(tuple(lines), line_end, form, tuple(elements), end.end())
+
+
+def read_table(path: Path) -> PlyTable:
+    """Read a PLY's header and vertex rows without interpreting them."""
+    head = header_of(path)
+    elements = head.elements
     names = [e.name for e in elements]
     if "chunk" in names or any(p.name.startswith("packed_") for e in elements for p in e.properties):
-        raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it to a plain PLY first")
+        raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it with gimp3d convert first")
     if names.count("vertex") != 1:
         raise BadInput(f"{path}: a PLY with one vertex element expected, found {names.count('vertex')}")
     vertex = elements[names.index("vertex")]
@@ -170,13 +205,15 @@ def read_table(path: Path) -> PlyTable:
     if vertex.count and not any(n.startswith("f_dc_") for n in seen):
         what = "it has plain colours (red, green, blue)" if "red" in seen else "a mesh or a point cloud"
         raise BadInput(f"{path} is not a Gaussian scene: no property f_dc_0, {what}")
-    read = _read_ascii if form == "ascii" else _read_binary
-    before, rows, after = read(path, elements, names.index("vertex"), end.end(), size, form)
-    return PlyTable(tuple(header), line_end, form, vertex.properties, rows, before, after)
+    read = _read_ascii if head.format == "ascii" else _read_binary
+    before, rows, after = read(path, elements, names.index("vertex"), head.size)
+    return PlyTable(head.lines, head.line_end, head.format, vertex.properties, rows, before, after)
 
 
 @dataclass(frozen=True)
-class _Element:
+class PlyElement:
+    """An element that a PLY announces."""
+
     name: str
     count: int
     properties: tuple[PlyProperty, ...]
@@ -189,7 +226,7 @@ class _Element:
         return sum(np.dtype(TYPES[p.type]).itemsize for p in self.properties)
 
 
-def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[_Element]]:
+def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[PlyElement]]:
     form, elements = "", []
     for line in lines[1:]:
         words = line.split()
@@ -198,7 +235,7 @@ def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[_Element]
         if words[0] == "format" and len(words) == 3 and words[1] in BYTE_ORDERS:
             form = words[1]
         elif words[0] == "element" and len(words) == 3 and re.fullmatch(r"\d{1,18}", words[2]):
-            elements.append(_Element(words[1], int(words[2]), ()))
+            elements.append(PlyElement(words[1], int(words[2]), ()))
         elif words[0] == "property" and elements and len(words) == 3 and words[1] in TYPES:
             elements[-1] = _with_property(elements[-1], PlyProperty(words[2], words[1]))
         elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":
@@ -210,19 +247,19 @@ def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[_Element]
     return form, elements
 
 
-def _with_property(element: _Element, new: PlyProperty) -> _Element:
-    return _Element(element.name, element.count, (*element.properties, new))
+def _with_property(element: PlyElement, new: PlyProperty) -> PlyElement:
+    return PlyElement(element.name, element.count, (*element.properties, new))
 
 
 def _read_binary(
-    path: Path, elements: Sequence[_Element], vertex: int, start: int, size: int, form: str
+    path: Path, elements: Sequence[PlyElement], vertex: int, start: int
 ) -> tuple[bytes, np.ndarray, bytes]:
     first = start
     for element in elements[:vertex]:
         if element.row_bytes is None:
             raise BadInput(f"{path}: element {element.name} with lists in front of the vertices is not supported")
         first += element.count * element.row_bytes
-    row_bytes, count = elements[vertex].row_bytes or 0, elements[vertex].count
+    row_bytes, count, size = elements[vertex].row_bytes or 0, elements[vertex].count, path.stat().st_size
     if first + count * row_bytes > size:
         raise BadInput(
             f"{path} is truncated: {count} rows of {row_bytes} bytes announced, {max(0, size - first)} bytes there"
@@ -237,9 +274,7 @@ def _read_binary(
     return before, rows, after
 
 
-def _read_ascii(
-    path: Path, elements: Sequence[_Element], vertex: int, start: int, size: int, form: str
-) -> tuple[bytes, np.ndarray, bytes]:
+def _read_ascii(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> tuple[bytes, np.ndarray, bytes]:
     lines = path.read_bytes()[start:].splitlines(keepends=True)
     first = sum(e.count for e in elements[:vertex])
     count = elements[vertex].count
@@ -300,7 +335,7 @@ def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
         log_scales=columns([f"scale_{k}" for k in range(scale_count)]),
         quats=columns([f"rot_{k}" for k in range(4)]),
         opacity_logits=columns(["opacity"])[:, 0],
-        sh=np.concatenate([dc[:, None], higher.transpose(0, 2, 1)], axis=1),
+        sh=np.ascontiguousarray(np.concatenate([dc[:, None], higher.transpose(0, 2, 1)], axis=1)),
         antialiased=any(ANTIALIASED.search(c) for c in table.comments),
     )
 
@@ -318,8 +353,6 @@ def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
     records = np.zeros(len(added), table.dtype)
     for p in table.properties:
         if p.name in fields:
-            if not np.isfinite(fields[p.name]).all():
-                raise ValueError(f"a new Gaussian has a {p.name} that is not finite")
             records[p.name] = fields[p.name]
     return records
 

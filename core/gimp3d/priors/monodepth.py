@@ -1,7 +1,15 @@
-"""Relative depth of the reference from elsewhere: the paper's monocular model, or a file (METHOD section 3)."""
+"""Relative depth of the reference from elsewhere: the paper's monocular model, or a file (METHOD section 3).
+
+A prior says what its numbers are, since models differ: `disparity` (near is large, any scale and shift: MiDaS, Depth
+Anything), `depth` (far is large, any scale and shift: Marigold and other affine-invariant depth) or `metric` (z-depth
+up to scale). `relative_disparity` brings all of them to disparity of any scale and shift, which is what s_f takes on.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -9,16 +17,33 @@ import numpy as np
 
 from ..errors import BadInput
 
+KINDS = ("disparity", "depth", "metric")
+IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of RGB in [0, 1], as published models were trained
+IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
+FREE_SIZE = (518, 518)  # (width, height) for models that take any size: 37 patches of 14 px, as Depth Anything
+USAGE = "use auto, harmonic, planar, file:PATH or onnx:PATH, the path followed by ,disparity ,depth or ,metric"
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """Depth of a view up to what `kind` leaves open."""
+
+    values: np.ndarray  # [H, W] float32, NaN = no value
+    kind: str = "disparity"  # disparity | depth | metric
+
 
 def depth_prior(
-    spec: str,  # auto | harmonic | planar | file:PATH[,disparity|,depth]
+    spec: str,  # auto | harmonic | planar | file:PATH[,KIND] | onnx:PATH[,KIND][,WIDTHxHEIGHT]
     height: int,
     width: int,
-) -> np.ndarray | None:
-    """Relative disparity [H, W] float32 (any scale and shift, NaN = no value), or None where the scene alone decides.
+    image: np.ndarray | None = None,  # [H, W, 3] uint8, the view without the object; what a model looks at
+) -> DepthPrior | None:
+    """The prior that `spec` names, of the view's size, or None where the scene alone decides.
 
-    A file holds disparity (near is large) unless it is said to hold depth: .npy, or any picture that OpenCV reads with
-    one channel of 8, 16 or 32 bits. It may have another resolution than the view, not another shape.
+    A file holds disparity unless it is said to hold depth (0 = no value): .npy, or any picture that OpenCV reads with
+    one channel of 8, 16 or 32 bits. It may have another resolution than the view, not another shape. A model is run by
+    OpenCV on the view, squeezed to the size that the model declares (else the one given after its path, else 518×518)
+    and normalised by ImageNet's mean and deviation; its first output of two long axes is resized back.
 
     Raises
     ------
@@ -28,19 +53,72 @@ def depth_prior(
     name, _, rest = spec.partition(":")
     if spec in ("auto", "harmonic", "planar"):
         return None
+    if name not in ("file", "onnx"):
+        raise BadInput(f"--depth-prior: unknown provider {spec!r}; {USAGE}")
+    size = re.search(r",(\d+)x(\d+)$", rest) if name == "onnx" else None
+    if size:
+        rest = rest[: size.start()]
+    path, _, kind = rest.rpartition(",")
+    if kind not in KINDS:
+        path, kind = rest, "disparity"
     if name == "file":
-        path, _, kind = rest.rpartition(",")
-        if kind not in ("disparity", "depth"):
-            path, kind = rest, "disparity"
-        return _from_file(Path(path), kind, height, width)
-    if name == "onnx":
-        raise BadInput("--depth-prior onnx: not available in this version; use auto, harmonic, planar or file:PATH")
-    raise BadInput(
-        f"--depth-prior: unknown provider {spec!r}; use auto, harmonic, planar or file:PATH[,disparity|,depth]"
-    )
+        values = _from_file(Path(path), height, width)
+        if kind != "disparity":
+            values = np.where(values == 0, np.nan, values)
+    else:
+        if image is None:
+            raise BadInput("--depth-prior onnx: there is no picture to look at")
+        values = _from_model(Path(path), image, (int(size[1]), int(size[2])) if size else None)
+    if not np.isfinite(values).any():
+        raise BadInput(f"--depth-prior: {path} gives no finite value")
+    if values.shape != (height, width):
+        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
+    return DepthPrior(values.astype(np.float32), kind)
 
 
-def _from_file(path: Path, kind: str, height: int, width: int) -> np.ndarray:
+def relative_disparity(
+    prior: DepthPrior,
+    disparity: np.ndarray,  # [H, W] 1/z of the scene
+    known: np.ndarray,  # [H, W] bool, where that is trusted
+) -> np.ndarray:
+    """[H, W] float32 disparity of any scale and shift, NaN = no value.
+
+    Metric depth is inverted. Affine depth m has an unknown scale and shift *in depth*, so 1/m would be bent:
+    z = a·m + b is fitted to the scene's depth first (relative errors, reweighted by Tukey's biweight), then inverted.
+    A fit with a ≤ 0 is none; −m then stands for the disparity, so that the ring shows the prior not to agree.
+    """
+    m = prior.values
+    if prior.kind == "disparity":
+        return m
+    if prior.kind == "metric":
+        return np.divide(1, m, out=np.full_like(m, np.nan), where=m > 0)
+    with np.errstate(invalid="ignore"):
+        common = known & (disparity > 0) & np.isfinite(disparity) & np.isfinite(m)
+    a, b = _affine(m[common].astype(np.float64), disparity[common].astype(np.float64))
+    if a <= 0:
+        return -m
+    z = a * m + b
+    nearest = 0.1 / disparity[common].max()  # what the fit sends to or behind the camera has no value
+    with np.errstate(invalid="ignore"):
+        return np.divide(1, z, out=np.full_like(m, np.nan), where=z > nearest).astype(np.float32)
+
+
+def _affine(m: np.ndarray, disparity: np.ndarray) -> tuple[float, float]:
+    """(a, b) that minimise |(a·m + b)·d − 1| robustly; (0, 0) where that is not determined."""
+    if len(m) < 3 or np.ptp(m) <= 1e-6 * np.abs(m).max():
+        return 0.0, 0.0
+    middle, spread = m.mean(), m.std()
+    rows = np.stack([(m - middle) / spread, np.ones_like(m)], -1) * disparity[:, None]
+    weight = np.ones(len(m))
+    for _ in range(10):
+        a, b = np.linalg.lstsq(rows * weight[:, None], weight, rcond=None)[0]
+        residual = np.abs(rows @ [a, b] - 1)
+        scale = 1.4826 * np.median(residual) + 1e-12
+        weight = np.maximum(1 - np.minimum(residual / (4.7 * scale), 1) ** 2, 0)
+    return float(a / spread), float(b - a * middle / spread)
+
+
+def _from_file(path: Path, height: int, width: int) -> np.ndarray:
     try:
         if path.suffix == ".npy":
             values = np.load(path, allow_pickle=False)
@@ -51,16 +129,100 @@ def _from_file(path: Path, kind: str, height: int, width: int) -> np.ndarray:
         raise BadInput(f"--depth-prior: cannot read {path} ({error})") from None
     if values.ndim != 2 or values.size == 0:
         raise BadInput(f"--depth-prior: {path} is not a depth picture of one channel")
-    if not np.isfinite(values).any():
-        raise BadInput(f"--depth-prior: {path} holds no finite value")
     if abs(values.shape[1] * height - values.shape[0] * width) > 1.5 * max(values.shape[0], height):
         raise BadInput(
             f"--depth-prior: {path} has {values.shape[1]}×{values.shape[0]} pixels, not the shape of the view "
             f"({width}×{height})"
         )
-    if kind == "depth":
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values = np.where(values > 0, 1.0 / values, np.nan).astype(np.float32)
-    if values.shape != (height, width):
-        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
     return values
+
+
+def _from_model(path: Path, image: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+    """[h, w] float32, a network's answer to a picture."""
+    try:
+        model = path.read_bytes()
+        width, height = declared_size(model) or size or FREE_SIZE
+    except OSError as error:
+        raise BadInput(f"--depth-prior onnx: cannot read {path} ({error.strerror})") from None
+    except (IndexError, ValueError):
+        raise BadInput(f"--depth-prior onnx: {path} is not an ONNX model") from None
+    method = cv2.INTER_AREA if width * height < image.shape[0] * image.shape[1] else cv2.INTER_CUBIC
+    squeezed = cv2.resize(image, (width, height), interpolation=method).astype(np.float32) / 255
+    blob = np.ascontiguousarray(((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None])
+    level = cv2.setLogLevel(0)  # silent: its complaints come as exceptions too
+    try:
+        net = cv2.dnn.readNetFromONNX(np.frombuffer(model, np.uint8))
+        net.setInput(blob)
+        outputs = net.forward(net.getUnconnectedOutLayersNames())
+    except cv2.error as error:
+        reason = " ".join(str(error.err or error).split())[:200]
+        raise BadInput(f"--depth-prior onnx: OpenCV cannot run {path} ({reason}); export it to a plain ONNX") from None
+    finally:
+        cv2.setLogLevel(level)
+    for output in outputs:
+        values = np.squeeze(output)
+        if values.ndim == 2 and min(values.shape) > 1:
+            return values.astype(np.float32)
+    shapes = ", ".join("×".join(map(str, o.shape)) for o in outputs)
+    raise BadInput(f"--depth-prior onnx: {path} answers with {shapes}, which is no depth picture")
+
+
+def declared_size(
+    model: bytes,  # an ONNX file
+) -> tuple[int, int] | None:
+    """(width, height) of the first input of four axes [N, C, H, W], or None if the model takes any.
+
+    Reads ModelProto.graph (7) .input (11), leaving out initializers (5): OpenCV does not tell what a model declares.
+
+    Raises
+    ------
+    ValueError, IndexError
+        If the bytes are not a protocol buffer with a graph.
+    """
+    graphs = _messages(memoryview(model), 7)
+    if not graphs:
+        raise ValueError("no graph")
+    constants = {bytes(name) for tensor in _messages(graphs[0], 5) for name in _messages(tensor, 8)}
+    for value in _messages(graphs[0], 11):
+        if bytes(_messages(value, 1)[0]) in constants:
+            continue
+        shapes = [s for t in _messages(value, 2) for tensor in _messages(t, 1) for s in _messages(tensor, 2)]
+        dims = [dict(_fields(dim)).get(1, 0) for shape in shapes for dim in _messages(shape, 1)]
+        if len(dims) == 4:
+            height, width = dims[2:]
+            return (width, height) if isinstance(width, int) and isinstance(height, int) and width * height else None
+    return None
+
+
+def _messages(message: memoryview, number: int) -> list[memoryview]:
+    """The length-delimited fields of one number."""
+    return [value for n, value in _fields(message) if n == number and isinstance(value, memoryview)]
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """(field number, value) of a protocol buffer message, in order."""
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        kind = key & 7
+        if kind == 0:
+            value, at = _varint(message, at)
+            yield key >> 3, value
+            continue
+        if kind not in (1, 2, 5):
+            raise ValueError(f"wire type {kind}")
+        length, at = _varint(message, at) if kind == 2 else (8 if kind == 1 else 4, at)
+        if at + length > len(message):
+            raise ValueError("cut off")
+        yield key >> 3, message[at : at + length]
+        at += length
+
+
+def _varint(message: memoryview, at: int) -> tuple[int, int]:
+    """(value, where it ends): seven bits a byte, the lowest first."""
+    value = shift = 0
+    while True:
+        value |= (message[at] & 127) << shift
+        shift, at = shift + 7, at + 1
+        if message[at - 1] < 128:
+            return value, at

@@ -2,43 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import combinations
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 import scipy.ndimage
 
 from ..errors import IllPosed
+from ..priors.monodepth import DepthPrior, relative_disparity
 from ..solvers.poisson import solve_poisson
+from .depth_evidence import DepthEvidence, free_space, gather_depth_evidence
+from .depth_fill import DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
+from .layers import AROUND, distance_to, without_front
+from .masks import ViewMasks
 
-AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
+SHOWN = 1500  # pairs of gradients kept for the fit's picture
 
-
-@dataclass(frozen=True)
-class DepthSettings:
-    """Lengths in pixels; differences of disparity are relative to the disparity itself."""
-
-    surface: str = "auto"  # "auto": planes where the ring shows them, else harmonic; "planar", "harmonic" insist
-    plane_ring: int = 24  # width of the ring on which planes are sought
-    plane_inlier: float = 0.008  # difference up to which a ring pixel lies on a plane
-    plane_share: float = 0.65  # of the ring that must lie on planes
-    most_planes: int = 3  # a floor and two walls
-    least_plane: float = 0.08  # share of the ring that a plane must hold
-    plane_tries: int = 256  # RANSAC samples per plane
-    junction: float = 0.95  # share of two planes' ring pixels that max or min must explain for them to meet
-    least_layer: float = 0.1  # share of the rim that what is on no plane must hold to reach into the hole
-    scale_factor: float | None = None  # s_f; None: measured on the ring. The paper uses 0.1
-    ring: int = 12  # width of the ring on which s_f is measured
-    gradient_step: int = 6  # differences over this distance suffer least from a prior's noise (research, K2)
-    minimum_ring: int = 10  # ring pixels below which nothing can be measured
-    minimum_correlation: float = 0.2  # between the prior's and the scene's gradients
-    smoothing: float = 12.0  # σ of the average of what the ring deviates from a plane
-    layer_jump: float = 0.06  # step on the rim that parts two layers
-    layer_band: int = 4  # width of the ring on which layers are told apart
-    occluder_share: float = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
-    low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
-    high: float = 4.0
+__all__ = ["DepthCompletion", "DepthSettings", "PriorFit", "complete_depth", "complete_disparity", "fit_prior"]
 
 
 @dataclass(frozen=True)
@@ -47,10 +28,85 @@ class DepthCompletion:
 
     disparity: np.ndarray  # [H, W] float32; 0 = infinitely far or nothing
     depth: np.ndarray  # [H, W] float32 z-depth; 0 where disparity is 0
+    trust: np.ndarray  # [H, W] float32, each pixel's confidence; 1 off the hole
     scale_factor: float  # s_f used; 0 = no guidance
+    gradients: np.ndarray  # [N, 2] float32 (prior's, scene's) differences on the ring that s_f was measured by
     clamped: int  # pixels whose disparity had to be clamped
+    contradicted: int  # pixels that other views see past
     confidence: float  # 0 to 1
     reason: str
+
+
+def complete_depth(
+    view: ViewMasks,  # the reference
+    views: Sequence[ViewMasks],  # all views; what they measured in the reference's hole is soft data
+    disparity: np.ndarray,  # [H, W] float32, the reference's without the object
+    known: np.ndarray,  # [H, W] bool, where that is trusted
+    prior: DepthPrior | None = None,
+    settings: DepthSettings = DepthSettings(),
+) -> DepthCompletion:
+    """Complete a view's depth (`complete_disparity`) with what other views saw of the hole.
+
+    Evidence clearly behind a surface that no view sees past is seen from under that surface, and dropped. A completed
+    surface that views do see past is pushed back along its rays to where they do not. What is contradicted even then
+    is counted and has low confidence.
+
+    Raises
+    ------
+    IllPosed
+        As `complete_disparity`.
+    """
+    known = without_front(disparity, known, view.target, view.occluder, settings.layers)
+    relative = None if prior is None else relative_disparity(prior, disparity, known)
+    evidence = gather_depth_evidence(view, views, settings.evidence)
+    ring = known & (distance_to(view.target) <= settings.planes.ring)
+    space = free_space(view, views, ring, settings.evidence)
+
+    def complete(evidence: DepthEvidence | None) -> DepthCompletion:
+        return complete_disparity(disparity, known, view.target, relative, settings, evidence)
+
+    done = complete(None)
+    behind = (evidence.weight > 0) & (evidence.disparity < (1 - settings.layers.step) * done.disparity)
+    evidence = _without(evidence, behind & ~space.seen_past(done.depth, behind))
+    evidence = _without(evidence, _remains(evidence, done.disparity, view.target, settings))
+    if (evidence.weight > 0).any():
+        done = complete(evidence)
+    contradicted = space.seen_past(done.depth, view.target)
+    pushed = int(contradicted.sum())
+    if pushed:
+        moved = space.pushed_back(done.depth, contradicted)
+        there = moved > 0
+        depth = np.where(there, moved, done.depth)
+        done = replace(done, depth=depth, disparity=np.divide(1, depth, out=done.disparity.copy(), where=there))
+        contradicted &= ~there
+    left = int(contradicted.sum())
+    seen = float((evidence.weight > 0).sum() / max(1, view.target.sum()))
+    words = [done.reason]
+    if seen >= 0.005:
+        words.append(f"{seen:.0%} of the hole measured by other views")
+    if pushed:
+        words.append(f"{pushed} pixels pushed back from where other views see through, {left} left")
+    share = left / max(1, view.target.sum())
+    return replace(
+        done,
+        trust=np.where(contradicted, np.minimum(done.trust, 0.1), done.trust),
+        contradicted=left,
+        confidence=done.confidence * (1 - share),
+        reason="; ".join(words),
+    )
+
+
+def _remains(evidence: DepthEvidence, disparity: np.ndarray, hole: np.ndarray, settings: DepthSettings) -> np.ndarray:
+    """[H, W] bool: small islands of evidence before the completed surface: splats of the object that were kept."""
+    before = (evidence.weight > 0) & (evidence.disparity > (1 + settings.layers.step / 2) * disparity)
+    islands, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(before, AROUND), AROUND)
+    area = np.bincount(islands[before], minlength=count + 1)
+    beside_rim = np.bincount(islands[~hole], minlength=count + 1) > 0
+    return before & (area < settings.least_island * hole.sum())[islands] & ~beside_rim[islands]
+
+
+def _without(evidence: DepthEvidence, dropped: np.ndarray) -> DepthEvidence:
+    return DepthEvidence(np.where(dropped, 0, evidence.disparity), np.where(dropped, 0, evidence.weight))
 
 
 def complete_disparity(
@@ -59,15 +115,17 @@ def complete_disparity(
     hole: np.ndarray,  # [H, W] bool, the target region T
     prior: np.ndarray | None = None,  # [H, W] float32 relative disparity, any scale and shift
     settings: DepthSettings = DepthSettings(),
+    evidence: DepthEvidence | None = None,  # soft data in the hole
 ) -> DepthCompletion:
-    """Fill a hole in a disparity map in the gradient domain (paper 3.3).
+    """Fill a hole in a disparity map.
 
-    Solves Δd = s_f Δd_m on the hole with d fixed on its known rim and natural boundaries elsewhere; the
-    printed divergence has the opposite sign (METHOD section 3). Without a prior, planes on which the
-    surroundings lie are continued (`planar_surfaces`) and the rest is harmonic. Nothing smears across layers:
-    rims of occluders are no boundary (`background_rim`), and sky keeps a part of the hole to itself.
-    Known pixels that are NaN, infinite or negative are not known. A part of the hole that has no rim takes the
-    prior, aligned to the ring, or the nearest depth.
+    With a prior, in the gradient domain (paper 3.3): Δd = s_f Δd_m on the hole with d fixed on its known rim and
+    natural boundaries elsewhere; the printed divergence has the opposite sign (METHOD section 3). Without one, planes
+    on which the surroundings lie are continued (`planar_surfaces`), and what lies on none by a thin plate. Nothing
+    smears across layers: rims of occluders are no boundary (`background_rim`), layers that a step parts keep their
+    parts of the hole, and so does sky. Evidence screens the solves (Σ_q (d_q − d_p) + w (e − d_p) = …) and takes part
+    in telling planes and layers. Known pixels that are NaN, infinite or negative are not known. A part of the hole
+    that has no rim takes the prior, aligned to the ring, or the nearest depth.
 
     Raises
     ------
@@ -79,28 +137,58 @@ def complete_disparity(
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
-        return _completion(scene, 0.0, 0, 1.0, "nothing to fill")
-    anchored = bool((trusted & scipy.ndimage.binary_dilation(hole)).any())
-    window = _window(hole, settings.plane_ring + 1) if anchored else np.s_[:, :]
-    background, inside = scene[window], hole[window]
-    rim = background_rim(background, trusted[window], inside, settings)
-    fit, guidance = PriorFit(0.0, 0.0, 0.7, "harmonic"), None
-    surfaces: tuple[Surface, ...] = ()
+        return _completion(scene, PriorFit(0.0, 0.0, 1.0, "nothing to fill"), np.ones(hole.shape), 0)
+    weight = np.zeros(hole.shape)
+    if evidence is not None:
+        usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
+        weight[usable], scene[usable] = evidence.weight[usable], evidence.disparity[usable]
+    around = surroundings(scene, trusted, hole, weight, settings)
+    guide, fit = None, PriorFit(0.0, 0.0, 1.0, "")
     if prior is not None:
-        fit = fit_prior(background, rim, inside, prior[window], settings, on_ring=anchored)
-        guidance = fit.scale * prior[window] + fit.shift if fit.scale else None
-    elif anchored and settings.surface != "harmonic":
-        planar = planar_surfaces(background, rim, inside, settings)
-        if planar.share >= settings.plane_share:
-            fit, surfaces = PriorFit(0.0, 0.0, planar.share, planar.reason), planar.surfaces
-        elif settings.surface == "planar":
-            raise IllPosed(f"depth: only {planar.share:.0%} of the surroundings lie on planes; use --depth-prior auto")
-    if not anchored and guidance is None:
+        fit = fit_prior(scene, around.measured, hole, prior, settings, on_ring=bool(around.touching.any()))
+        guide = fit.scale * _without_gaps(prior) if fit.scale else None
+    if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
-    filled = _fill(background, rim, inside, surfaces, guidance, settings)
-    filled, clamped, confidence, reason = _settle(filled, background, rim, inside, fit, settings)
-    scene[window] = np.where(inside, filled, background)
-    return _completion(scene, fit.scale, clamped, confidence, reason)
+    result, trust = scene.copy(), np.ones(hole.shape)
+    done: list[_Settled] = []
+    most_sure = fit.confidence
+    reasons: list[str] = [fit.reason]
+    for part in _parts(hole, settings.small_part):
+        near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
+        window = _window(part, settings.planes.ring + 1) if near else np.s_[:, :]
+        inside = part[window]
+        own_guide = None if guide is None else guide[window]
+        around = surroundings(scene[window], trusted[window], inside, (weight * part)[window], settings, own_guide)
+        surface = "harmonic" if part.sum() <= settings.small_part else settings.surface
+        plan = choose_plan(around, replace(settings, surface=surface), insist=not done)
+        missed = withheld_miss(around, plan, settings, around.rim)
+        settled = _settle(fill(around, plan, settings), around, fit.shift, settings)
+        result[window][inside] = settled.disparity[inside]
+        trust[window][inside] = (settled.share * fit.confidence * _trust(around, missed, settings))[inside]
+        reasons += [*([] if done else [plan.reason]), *settled.notes]
+        done.append(settled)
+        if part.sum() > 0.05 * hole.sum():
+            most_sure = min(most_sure, settled.share)
+    confidence = min(float(trust[hole].mean()), most_sure)
+    reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
+    clamped = sum(s.clamped for s in done)
+    return _completion(result, replace(fit, confidence=confidence, reason=reason), trust, clamped)
+
+
+def _without_gaps(prior: np.ndarray) -> np.ndarray:
+    """The prior with its NaN pixels interpolated."""
+    gaps = ~np.isfinite(prior)
+    return solve_poisson(gaps, ~gaps, prior).values
+
+
+def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
+    """The hole's connected parts, the largest first: each has its own surroundings. Small ones together come last."""
+    labels, count = scipy.ndimage.label(hole, AROUND)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    large = [labels == k for k in np.argsort(-sizes, kind="stable") if sizes[k] > small]
+    rest = hole & (sizes[labels] <= small)
+    return [*large, rest] if rest.any() else large
 
 
 @dataclass(frozen=True)
@@ -111,6 +199,7 @@ class PriorFit:
     shift: float  # matters only where the hole has no rim
     confidence: float
     reason: str
+    gradients: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))  # [N, 2] (prior's, scene's)
 
 
 def fit_prior(
@@ -124,12 +213,13 @@ def fit_prior(
     """Measure s_f by least squares between gradients on the ring (METHOD section 3).
 
     Mean gradients are left out: a slope is harmonic, so it needs no prior and says nothing about one. With a noisy
-    prior the best s_f is below the true gain, which is what least squares gives. 0 where the prior says nothing: too
-    few pixels, no variance, no or negative agreement.
+    prior the best s_f is below the true gain, which is what least squares gives; where ring and prior agree poorly it
+    is lowered further, so that guidance hardly ever does worse than none. 0 where the prior says nothing: too few
+    pixels, no variance, no or negative agreement.
     """
     ring = known & (disparity > 0) & np.isfinite(prior)
     if on_ring:
-        ring &= _distance(hole) <= settings.ring
+        ring &= distance_to(hole) <= settings.ring
     k, pairs = settings.gradient_step, []
     for near, far in ((np.s_[:, :-k], np.s_[:, k:]), (np.s_[:-k], np.s_[k:])):
         both = ring[near] & ring[far]
@@ -138,270 +228,72 @@ def fit_prior(
             pairs.append(steps - steps.mean(axis=1, keepdims=True))
     m, d = np.concatenate([np.zeros((2, 0)), *pairs], axis=1)
     if len(m) < settings.minimum_ring:
-        return PriorFit(0.0, 0.0, 0.3, "harmonic: too little is known round the hole to scale the prior")
+        return PriorFit(0.0, 0.0, 0.3, "prior not used, too little is known round the hole to scale it")
+    shown = np.stack([m, d], -1)[:: max(1, len(m) // SHOWN)].astype(np.float32)
 
     def fitted(scale: float, confidence: float, reason: str) -> PriorFit:
-        return PriorFit(scale, float(np.median((disparity - scale * prior)[ring])), confidence, reason)
+        shift = float(np.median((disparity - scale * prior)[ring])) if scale else 0.0
+        return PriorFit(scale, shift, confidence, reason, shown)
 
     if settings.scale_factor is not None:
         return fitted(settings.scale_factor, 0.5, f"guided, s_f = {settings.scale_factor:g} as set")
     if (m**2).mean() < 1e-12 * max(float(np.abs(prior[ring]).max()) ** 2, 1e-300):
-        return PriorFit(0.0, 0.0, 0.3, "harmonic: the prior is constant round the hole")
-    scale = float((m * d).sum() / (m**2).sum())
+        return fitted(0.0, 0.3, "prior not used, it is constant round the hole")
     correlation = float((m * d).sum() / np.sqrt((m**2).sum() * max((d**2).sum(), 1e-300)))
     if correlation < settings.minimum_correlation:
-        reason = f"harmonic: the prior does not fit the scene (correlation {correlation:.2f})"
-        return PriorFit(0.0, 0.0, 0.3, reason)
-    words = f"guided, s_f = {scale:.3g} measured on the ring (correlation {correlation:.2f})"
-    return fitted(scale, correlation, words)
+        return fitted(0.0, 0.3, f"prior not used, it does not fit the scene (correlation {correlation:.2f})")
+    share = min(1.0, correlation / settings.full_correlation) ** 2
+    scale = share * float((m * d).sum() / (m**2).sum())
+    return fitted(scale, correlation, f"guided, s_f = {scale:.3g} measured on the ring (correlation {correlation:.2f})")
 
 
-def background_rim(
-    disparity: np.ndarray,  # [H, W]
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    settings: DepthSettings = DepthSettings(),
-) -> np.ndarray:
-    """[H, W] bool: the known pixels that may bound the hole, that is, not those of occluders in front of it.
-
-    Layers are the parts of the band round the hole between jumps. Taken from the farthest on, those that together make
-    up most of the rim are what the hole lies in; nearer ones that end at a jump are occluders, behind which the others
-    go on (METHOD section 3).
-    Surfaces that meet, as a floor and a wall, have no jump between them, however steep.
-    """
-    distance = _distance(hole)
-    band = known & (distance <= settings.layer_band)
-    jumps = _jumps(disparity, known, band, settings.layer_jump)
-    layers, count = scipy.ndimage.label(band & ~jumps, AROUND)
-    if count < 2 or not jumps.any():
-        return known
-    numbers = np.arange(1, count + 1)
-    sizes = scipy.ndimage.sum_labels(distance < 2, layers, numbers)
-    heights = scipy.ndimage.median(disparity, layers, numbers)
-    beside_jump = np.isin(numbers, layers[scipy.ndimage.binary_dilation(jumps, AROUND)])
-    far_first = np.argsort(heights)
-    reached = np.cumsum(sizes[far_first])
-    background = heights[far_first][np.searchsorted(reached, (1 - settings.occluder_share) * reached[-1])]
-    nearer = (1 + settings.layer_jump) * background
-    occluder = beside_jump & (heights > nearer)
-    front = np.isin(layers, numbers[occluder])
-    # Of the step's own pixels, those on its upper half belong to the occluder.
-    top = scipy.ndimage.maximum_filter(np.where(known, disparity, -np.inf), 5)
-    bottom = scipy.ndimage.minimum_filter(np.where(known, disparity, np.inf), 5)
-    with np.errstate(invalid="ignore"):
-        upper = disparity > (top + bottom) / 2
-    edge = jumps & scipy.ndimage.binary_dilation(front, AROUND, iterations=2) & upper
-    return known & ~front & ~edge
-
-
-def _jumps(disparity: np.ndarray, known: np.ndarray, band: np.ndarray, threshold: float) -> np.ndarray:
-    """[H, W] bool: pixels of the band within 2 px of a step.
-
-    The measure is the second difference over ±2 px, which is 0 on planes at any slant and the step's height at a
-    step, also one blurred over a pixel or two.
-    """
-    padded = np.pad(np.where(known, disparity, np.nan), 2, constant_values=np.nan)
-    h, w = disparity.shape
-    found = np.zeros(disparity.shape, bool)
-    with np.errstate(invalid="ignore"):
-        for dy, dx in ((0, 2), (2, 0), (2, 2), (2, -2)):
-            after = padded[2 + dy : 2 + dy + h, 2 + dx : 2 + dx + w]
-            before = padded[2 - dy : 2 - dy + h, 2 - dx : 2 - dx + w]
-            found |= np.abs(before + after - 2 * disparity) > threshold * np.maximum(before, after)
-    return found & band
+def _trust(around: Surroundings, missed: float, settings: DepthSettings) -> np.ndarray:
+    """[H, W]: each pixel's confidence, from the miss on a withheld band and the distance to what is measured."""
+    far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
+    expected = (settings.expected if np.isnan(missed) else missed) * (0.5 + far / settings.withheld)
+    return 1 / (1 + expected / settings.expected)
 
 
 @dataclass(frozen=True)
-class Surface:
-    """A part of the background that planes describe: one, or some that meet in a line."""
+class _Settled:
+    """A part of the hole with every pixel decided."""
 
-    disparity: np.ndarray  # [H, W] float64, continued over the whole image
-    on: np.ndarray  # [H, W] bool, the ring's pixels on it
-    planes: int = 1
-
-
-@dataclass(frozen=True)
-class PlanarSurfaces:
-    """What of the hole's surroundings is planar."""
-
-    surfaces: tuple[Surface, ...]
-    share: float  # of the ring that lies on them
-    reason: str
+    disparity: np.ndarray  # [H, W]
+    clamped: int
+    share: float  # of the confidence that is left
+    notes: list[str]
 
 
-def planar_surfaces(
-    disparity: np.ndarray,  # [H, W]; 0 = sky
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    settings: DepthSettings = DepthSettings(),
-) -> PlanarSurfaces:
-    """The planes d = a·u + b·v + c on which the ring round the hole lies, largest first; sky is the plane d = 0.
-
-    A plane in space is exactly affine in disparity, whatever the camera. Sequential RANSAC (Fischler & Bolles
-    1981) with a fixed seed, each plane refined by least squares. Only planes that touch the hole count. Two that
-    the ring shows to meet become one surface: the nearer one where they are concave (a room seen from inside:
-    max of disparities), the farther where convex (min).
-    """
-    distance = _distance(hole)
-    ring = known & (distance <= settings.plane_ring)
-    rim = known & (distance < 2)
-    sky = ring & (disparity == 0)
-    left = ring & ~sky
-    rng = np.random.default_rng(0)
-    found = [Surface(np.zeros(hole.shape), sky)] if sky.any() else []
-    for _ in range(settings.most_planes):
-        plane = _largest_plane(disparity, left, settings, rng)
-        if plane is None:
-            break
-        near = left & (np.abs(plane - disparity) < settings.plane_inlier * disparity)
-        # Where a plane merely cuts through rough ground, its inliers are scattered.
-        inliers, candidates = (cv2.boxFilter(a.astype(np.float32), -1, (7, 7)) for a in (near, left))
-        on = near & (inliers > 0.6 * candidates)
-        left &= ~near
-        if on.sum() < settings.least_plane * ring.sum():
-            break
-        found.append(Surface(plane, on))
-    share = float(sum(s.on.sum() for s in found) / max(1, ring.sum()))
-    planes = sum(s.disparity.any() for s in found)
-    reason = f"planar: {share:.0%} of the surroundings lie on {planes} plane{'s' if planes != 1 else ''}"
-    touching = [s for s in found if (s.on & rim).sum() > 0.03 * rim.sum()]
-    return PlanarSurfaces(tuple(_joined(touching, settings)), share, reason)
-
-
-def _largest_plane(
-    disparity: np.ndarray, ring: np.ndarray, settings: DepthSettings, rng: np.random.Generator
-) -> np.ndarray | None:
-    """The plane [H, W] that most ring pixels lie on."""
-    rows, cols = np.nonzero(ring)
-    if len(rows) < max(3, settings.minimum_ring):
-        return None
-    # Divided by d, residuals are relative.
-    d = disparity[rows, cols]
-    points = np.stack([cols, rows, np.ones(len(rows))], -1) / d[:, None]
-    samples = rng.integers(0, len(rows), (settings.plane_tries, 3))
-    solvable = np.abs(np.linalg.det(points[samples] * d[samples][..., None])) > 1.0  # not three pixels in a line
-    if not solvable.any():
-        return None
-    candidates = np.linalg.solve(points[samples[solvable]], np.ones((solvable.sum(), 3, 1)))[..., 0]
-    thinned = points[:: max(1, len(points) // 2000)]
-    votes = (np.abs(thinned @ candidates.T - 1) < settings.plane_inlier).sum(0)
-    best = candidates[int(votes.argmax())]
-    for _ in range(3):
-        on = np.abs(points @ best - 1) < settings.plane_inlier
-        if on.sum() < 3:
-            return None
-        best = np.linalg.lstsq(points[on], np.ones(on.sum()), rcond=None)[0]
-    v, u = np.mgrid[: ring.shape[0], : ring.shape[1]]
-    return best[0] * u + best[1] * v + best[2]
-
-
-def _joined(surfaces: list[Surface], settings: DepthSettings) -> list[Surface]:
-    """The surfaces, with those that meet made one."""
-    for a, b in combinations(surfaces, 2):
-        for meet in (np.maximum, np.minimum):
-            joint = meet(a.disparity, b.disparity)
-            kept = [
-                (np.abs(joint - s.disparity) <= settings.plane_inlier * np.abs(s.disparity))[s.on].mean()
-                for s in (a, b)
-            ]
-            if min(kept) >= settings.junction:
-                others = [s for s in surfaces if s is not a and s is not b]
-                return _joined([Surface(joint, a.on | b.on, a.planes + b.planes), *others], settings)
-    return surfaces
-
-
-def _fill(
-    disparity: np.ndarray,
-    rim: np.ndarray,
-    hole: np.ndarray,
-    surfaces: tuple[Surface, ...],
-    guidance: np.ndarray | None,
-    settings: DepthSettings,
-) -> np.ndarray:
-    """Disparity [H, W] float64 of the hole, NaN where nothing says anything.
-
-    Each surface, and what of the rim is on none, gets the part of the hole where the harmonic extension of its share
-    of the rim is largest.
-    """
-    rim = rim & scipy.ndimage.binary_dilation(hole)
-    sky = rim & (disparity == 0)
-    if not surfaces and sky.any():
-        surfaces = (Surface(np.zeros(hole.shape), sky),)
-    loose = len(surfaces)
-    layer = _layers(disparity, rim, surfaces, settings)
-    present = np.unique(layer[layer >= 0])
-    part = np.full(hole.shape, present[0] if len(present) else loose)
-    if len(present) > 1:
-        votes = solve_poisson(hole, layer >= 0, (layer[..., None] == present).astype(np.float64)).values
-        part = present[np.nan_to_num(votes).argmax(-1)]
-    rest = hole & (part == loose)
-    filled = np.where(rest, solve_poisson(rest, layer == loose, disparity, guidance).values, np.nan)
-    for k, surface in enumerate(surfaces):
-        own = hole & (part == k)
-        filled[own] = (surface.disparity + _deviation(disparity, surface, own, layer == k, settings))[own]
-    return filled
-
-
-def _layers(
-    disparity: np.ndarray, rim: np.ndarray, surfaces: tuple[Surface, ...], settings: DepthSettings
-) -> np.ndarray:
-    """[H, W] int: the surface on which each rim pixel lies, len(surfaces) for none, −1 off the rim."""
-    layer = np.where(rim, len(surfaces), -1)
-    for k, surface in reversed(list(enumerate(surfaces))):
-        step = settings.layer_jump * np.maximum(disparity, surface.disparity)
-        layer[rim & (np.abs(disparity - surface.disparity) <= step)] = k
-    if surfaces and (layer == len(surfaces)).sum() < settings.least_layer * rim.sum():
-        layer[layer == len(surfaces)] = -1
-    return layer
-
-
-def _deviation(
-    disparity: np.ndarray, surface: Surface, own: np.ndarray, rim: np.ndarray, settings: DepthSettings
-) -> np.ndarray:
-    """[H, W]: what the ring deviates from the surface, averaged along it and extended harmonically into the hole.
-
-    The pixels that touch the hole are biased by the object's haze: averaging over the whole ring is 4 to 6 times as
-    accurate as meeting them exactly, measured on scenes with known truth.
-    """
-    known = surface.on.astype(np.float64)
-    weight = cv2.GaussianBlur(known, (0, 0), settings.smoothing)
-    total = cv2.GaussianBlur(known * (disparity - surface.disparity), (0, 0), settings.smoothing)
-    average = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0.01)
-    return np.nan_to_num(solve_poisson(own, rim & (weight > 0.01), average).values)
-
-
-def _settle(
-    filled: np.ndarray,
-    disparity: np.ndarray,
-    rim: np.ndarray,
-    hole: np.ndarray,
-    fit: PriorFit,
-    settings: DepthSettings,
-) -> tuple[np.ndarray, int, float, str]:
-    """Every pixel decided and kept to the ring's range: (disparity, pixels clamped, confidence, reason)."""
-    confidence, reason = fit.confidence, fit.reason
-    undecided = hole & ~np.isfinite(filled)
-    if undecided.any():
-        nearest = scipy.ndimage.distance_transform_edt(~rim, return_distances=False, return_indices=True)
-        filled = np.where(undecided, disparity[tuple(nearest)], filled)
-        confidence, reason = min(confidence, 0.3), f"{reason}; a part of the hole has no rim: nearest depth used"
-    ring = rim & (_distance(hole) <= settings.layer_band)
-    around = disparity[ring if ring.any() else rim]
-    finite = around[around > 0]
+def _settle(filled: np.ndarray, around: Surroundings, shift: float, settings: DepthSettings) -> _Settled:
+    """Every pixel decided and kept to the ring's range."""
+    share, notes = 1.0, []
+    undecided = around.hole & ~np.isfinite(filled)
+    if undecided.any() and around.guide is not None:
+        filled, share = np.where(undecided, around.guide + shift, filled), 0.5
+        notes.append("a part of the hole has no rim: the prior used as it is aligned")
+    elif undecided.any():
+        nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
+        filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
+        notes.append("a part of the hole has no rim: nearest depth used")
+    ring = around.measured & (around.distance <= settings.layers.band)
+    beside = around.disparity[ring if ring.any() else around.measured]
+    finite = beside[beside > 0]
     low, high = (settings.low * finite.min(), settings.high * finite.max()) if len(finite) else (0.0, 0.0)
-    if (around == 0).any():  # where the ring shows sky, so far means infinitely far
+    if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
         filled = np.where(filled < low, 0.0, filled)
         low = 0.0
-    clamped = int((hole & ((filled < low) | (filled > high))).sum())
-    if clamped > 0.05 * hole.sum():
-        confidence, reason = 0.5 * confidence, f"{reason}; {clamped} pixels clamped to the ring's range"
-    return np.clip(filled, low, high), clamped, confidence, reason
+    clamped = int((around.hole & ((filled < low) | (filled > high))).sum())
+    if clamped > 0.05 * around.hole.sum():
+        share *= 0.5
+        notes.append(f"{clamped} pixels clamped to the ring's range")
+    return _Settled(np.clip(filled, low, high), clamped, share, notes)
 
 
-def _completion(disparity: np.ndarray, scale: float, clamped: int, confidence: float, reason: str) -> DepthCompletion:
+def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int) -> DepthCompletion:
     disparity = disparity.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
-    return DepthCompletion(disparity, depth, scale, clamped, confidence, reason)
+    trust = trust.astype(np.float32)
+    return DepthCompletion(disparity, depth, trust, fit.scale, fit.gradients, clamped, 0, fit.confidence, fit.reason)
 
 
 def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:
@@ -411,8 +303,3 @@ def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:
         slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
         slice(max(cols[0] - margin, 0), cols[-1] + margin + 1),
     )
-
-
-def _distance(hole: np.ndarray) -> np.ndarray:
-    """[H, W] float32: distance to the hole in pixels, 0 inside."""
-    return cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)

@@ -1,24 +1,50 @@
-"""Which Gaussians go, and where each view has to be filled (paper 3.2, METHOD section 1)."""
+"""Where each view has to be filled once the object is gone (paper 3.2, METHOD section 1)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..box import Box, Region, in_region
+from ..box import Region
 from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import RasterSettings, contributions, footprint, render, surface_depth
+from ..raster import footprint, render, surface_depth
 from ..threads import parallel_map
+from .outline import (
+    Window,
+    box_polygon,
+    cropped,
+    fill_polygon,
+    gaussians_window,
+    guard_gaussians,
+    surface_points,
+    window_round,
+)
+from .selection import (
+    Selection,
+    SelectionSettings,
+    Sighting,
+    by_centre,
+    object_and_rim,
+    select,
+    select_removed,
+    weigh,
+    weigh_revealed,
+    without_revealed,
+)
+from .surroundings import follow_surroundings
+from .visibility import Sight, depth_agreement
 
-EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -29,16 +55,19 @@ class MaskSettings:
     guard_scale: float = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
     guard_footprint: float = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
     changed: float = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
+    hides: float = 0.5  # blend weight of removed Gaussians above which a pixel shows nothing else
     solid: float = 0.9  # alpha after removal from which a surface counts as there
     void: float = 0.1  # alpha after removal below which there is nothing
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
-    support: float = 0.3  # share of a Gaussian's weight that views must have seen with the object there; 0 keeps all
-    support_pixels: float = 0.5  # summed weight below which a Gaussian does not matter
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
     occluder_step: float = 0.06  # how much nearer (relative) a kept surface counts as in front
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
+    around: int = 24  # px round what the object touched that are drawn anew without it
+    least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
+    least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
+    selection: SelectionSettings = SelectionSettings()
 
 
 @dataclass(frozen=True)
@@ -47,10 +76,10 @@ class ViewMasks:
 
     camera: Camera
     polygon: np.ndarray  # bool, the projected boxes
-    silhouette: np.ndarray  # bool, pixels that the removed Gaussians touched
+    silhouette: np.ndarray  # bool, pixels that the removed Gaussians touched, and those of the extra mask
     occluder: np.ndarray  # bool, kept surfaces in front of the object, at its outline
     target: np.ndarray  # bool, T: the pixels to fill
-    depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing
+    depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing, or nothing to be trusted
     depth_after: np.ndarray  # float32 z without it
     alpha_after: np.ndarray  # float32
 
@@ -59,115 +88,22 @@ class ViewMasks:
 class Masks:
     """The removal's masks in every usable view."""
 
-    removed: np.ndarray  # [N] bool
+    selection: Selection
     views: tuple[ViewMasks, ...]
     left_out: tuple[str, ...]  # IDs of cameras inside the region, or whose frame misses it
     mode: str  # the mode really used
     confidence: float
     reason: str
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def removed(self) -> np.ndarray:
+        """[N] bool."""
+        return self.selection.removed
 
     @property
     def hole_pixels(self) -> int:
         return int(sum(v.target.sum() for v in self.views))
-
-
-def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
-    """[N] bool: Gaussians whose centre lies in the region (METHOD section 1). Unusable rows are never removed."""
-    return in_region(region, gaussians.means.astype(np.float64)) & gaussians.usable
-
-
-def unsupported_gaussians(
-    gaussians: Gaussians,
-    removed: np.ndarray,  # [N] bool
-    cameras: Sequence[Camera],
-    settings: MaskSettings,
-) -> np.ndarray:
-    """[N] bool: kept Gaussians that only the removal reveals (METHOD section 1, contamination).
-
-    Trainers leave smears of the object's colour under and behind its surface, where no photo ever saw them. Their blend
-    weight over all views is small while the object is there and large once it is gone. What really lies behind the
-    object was seen past it in other views, and stays.
-    """
-    if settings.support <= 0:
-        return np.zeros(len(gaussians), bool)
-    kept = gaussians.take(~removed)
-
-    def weights(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        raster = RasterSettings()
-        before = contributions(gaussians, camera, raster).total[~removed]
-        return before, contributions(kept, camera, raster).total
-
-    sums = parallel_map(weights, cameras)
-    before, after = np.sum([b for b, _ in sums], axis=0), np.sum([a for _, a in sums], axis=0)
-    found = np.zeros(len(gaussians), bool)
-    found[~removed] = (after > settings.support_pixels) & (before < settings.support * after)
-    return found
-
-
-def box_polygon(
-    box: Box,
-    camera: Camera,
-    near: float,  # z below which the box is cut away, scene units
-) -> np.ndarray | None:
-    """The convex outline of a box in a view, [M, 2] pixels, clipped against the near plane before projecting.
-
-    None if nothing of the box lies in front of the camera.
-    """
-    points = camera.to_camera(box.corners())
-    in_front = points[:, 2] >= near
-    visible = [points[in_front]]
-    for a, b in EDGES:
-        if in_front[a] != in_front[b]:
-            s = (near - points[a, 2]) / (points[b, 2] - points[a, 2])
-            visible.append((points[a] + s * (points[b] - points[a]))[None])
-    cut = np.concatenate(visible)
-    if len(cut) < 3:
-        return None
-    uv = cut[:, :2] / cut[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    hull = cv2.convexHull(uv.astype(np.float32))[:, 0]
-    return hull if len(hull) >= 3 else None
-
-
-def fill_polygon(
-    polygon: np.ndarray,  # [M, 2] convex, pixels
-    width: int,
-    height: int,
-) -> np.ndarray:
-    """[H, W] bool: pixels whose centre lies inside a convex polygon of either orientation."""
-    mask = np.zeros((height, width), dtype=bool)
-    low = np.clip(np.floor(polygon.min(0)), 0, [width, height]).astype(int)
-    high = np.clip(np.ceil(polygon.max(0)), 0, [width, height]).astype(int)
-    if (high <= low).any():
-        return mask
-    x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
-    start, end = polygon.astype(np.float64), np.roll(polygon.astype(np.float64), -1, axis=0)
-    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(start, end)]
-    inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
-    mask[low[1] : high[1], low[0] : high[0]] = inside
-    return mask
-
-
-def guard_gaussians(
-    gaussians: Gaussians,
-    candidates: np.ndarray,  # [N] bool, the kept ones
-    polygon: np.ndarray,  # [M, 2]
-    camera: Camera,
-    scale: float,
-) -> np.ndarray:
-    """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
-    uv, _ = camera.project(gaussians.means.astype(np.float64))
-    centre = polygon.mean(0)
-
-    def inside(outline: np.ndarray) -> np.ndarray:
-        rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
-        start, end = outline, np.roll(outline, -1, axis=0)
-        u, v = uv[rows, 0, None], uv[rows, 1, None]
-        side = (end - start)[:, 0] * (v - start[:, 1]) - (end - start)[:, 1] * (u - start[:, 0])
-        result = np.zeros(len(uv), dtype=bool)
-        result[rows] = (side >= 0).all(1) | (side <= 0).all(1)
-        return result
-
-    return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
 
 
 def find_masks(
@@ -176,54 +112,74 @@ def find_masks(
     cameras: Sequence[Camera],
     settings: MaskSettings = MaskSettings(),
     progress: Progress = silent,
+    photos: Mapping[str, np.ndarray] | None = None,  # ID → [H, W, 3] uint8, with the object
+    extra: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, to be filled too: shadows, reflections
 ) -> Masks:
     """Select the object's Gaussians and find the target region T of every view (paper 3.2; METHOD section 1).
+
+    Every view is drawn a fixed number of times. What appears behind the object is judged as points of space, by all
+    views together, so that all targets agree.
 
     Raises
     ------
     BadInput
-        If the mode is unknown.
+        If the mode is unknown, or a photo or an extra mask has not its view's size.
     IllPosed
         If every Gaussian is selected, or no camera sees the region from outside.
     """
     if settings.mode not in ("need", "paper"):
         raise BadInput(f"masks: unknown mode {settings.mode!r}; use need or paper")
-    removed = select_removed(gaussians, region)
-    if not removed.any():
-        return Masks(removed, (), (), settings.mode, 1.0, "the region holds no Gaussian: nothing to remove")
-    if removed[gaussians.usable].all():
+    inside = select_removed(gaussians, region)
+    if not inside.any():
+        return Masks(by_centre(inside), (), (), settings.mode, 1.0, "the region holds no Gaussian: nothing to remove")
+    if inside[gaussians.usable].all():
         raise IllPosed("ROI: it holds the whole scene; nothing would be left to fill from, make it smaller")
     usable = [c for c in cameras if not any(b.contains(c.centre[None])[0] for b in region)]
     polygons = {c.id: _polygons(region, c, settings) for c in usable}
     seeing = [c for c in usable if any(fill_polygon(p, c.width, c.height).any() for p in polygons[c.id])]
     if not seeing:
-        inside = len(cameras) - len(usable)
+        within = len(cameras) - len(usable)
         raise IllPosed(
-            f"no usable view: of {len(cameras)} cameras {inside} are inside the ROI and the others do not frame it; "
+            f"no usable view: of {len(cameras)} cameras {within} are inside the ROI and the others do not frame it; "
             "add views that look at it from outside"
         )
-    revealed = unsupported_gaussians(gaussians, removed, seeing, settings)
-    removed = removed | revealed
-    kept = gaussians.take(~removed)
-    done = 0
-
-    def measure(camera: Camera) -> ViewMasks:
-        nonlocal done
-        view = _measure_view(gaussians, kept, removed, camera, polygons[camera.id], settings)
-        done += 1
-        progress("masks", done, len(seeing), camera.id)
-        return view
-
-    views = parallel_map(measure, seeing)
-    if settings.mode == "need":
-        views = parallel_map(lambda v: _need_only(v, views, settings), views)
+    passes = _Passes(progress, 3 * len(seeing))
+    before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
+    selection = by_centre(inside)
+    if not settings.selection.by_centre:
+        selection = _choose(gaussians, region, before, passes, settings.selection)
+    kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
+    after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
+    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)])
+    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, settings), range(len(after)))
+    mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
+    if warnings or mode == "paper":
+        mode = "paper"
+        needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
+    views = tuple(_view_masks(b, a, n, mode, settings) for b, a, n in zip(before, after, needed))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
-    reason = (
-        f"{len(views)} views see the region; {share:.0%} of its projection needs filling; "
-        f"{int(revealed.sum())} Gaussians outside the box go as well: no view saw them unhidden"
+    reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
+    confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
+    return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), warnings)
+
+
+def _inconsistencies(before: Sequence[_Before], settings: MaskSettings) -> tuple[str, ...]:
+    """Why what one view shows says nothing about the others, in words."""
+    instead = "every pixel of the box's outline is filled (mode paper)"
+    cameras = [b.camera for b in before]
+    agreement = depth_agreement(
+        cameras, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance
     )
-    return Masks(removed, tuple(views), left_out, settings.mode, len(views) / len(cameras), reason)
+    likeness = [b.likeness for b in before if np.isfinite(b.likeness)]
+    found = []
+    if agreement < settings.least_agreement:
+        found.append(f"views place only {agreement:.0%} of the surface alike: {instead}")
+    if likeness and np.median(likeness) < settings.least_likeness:
+        found.append(
+            f"photos and scene do not match (correlation {np.median(likeness):.2f}), check the poses: {instead}"
+        )
+    return tuple(found)
 
 
 def _polygons(region: Region, camera: Camera, settings: MaskSettings) -> list[np.ndarray]:
@@ -231,81 +187,187 @@ def _polygons(region: Region, camera: Camera, settings: MaskSettings) -> list[np
     return [p for p in found if p is not None]
 
 
-def _measure_view(
+class _Passes:
+    """Work on all views, several times over, with progress."""
+
+    def __init__(self, progress: Progress, total: int) -> None:
+        self.progress, self.total, self.done = progress, total, 0
+
+    def over(self, work: Callable[[T], R], views: Iterable[T]) -> list[R]:
+        def counted(view: T) -> R:
+            result = work(view)
+            self.done += 1
+            self.progress("masks", self.done, self.total)
+            return result
+
+        return parallel_map(counted, views)
+
+
+@dataclass(frozen=True)
+class _Before:
+    """A view with the object; arrays [H, W]."""
+
+    camera: Camera
+    polygons: list[np.ndarray]
+    window: Window  # of the region and a margin
+    depth: np.ndarray
+    alpha: np.ndarray
+    agrees: np.ndarray  # bool, the photo shows what the scene shows, as far as it was looked at
+    likeness: float  # correlation of photo and scene in the window; NaN if it cannot be told
+    extra: np.ndarray | None  # bool, the extra mask
+
+
+@dataclass(frozen=True)
+class _After:
+    """A view without the object; arrays [H, W]."""
+
+    depth: np.ndarray
+    alpha: np.ndarray
+    weight: np.ndarray  # blend weight of the removed Gaussians, with the object in place
+
+
+def _look(
     gaussians: Gaussians,
-    kept: Gaussians,
-    removed: np.ndarray,
     camera: Camera,
     polygons: list[np.ndarray],
+    photos: Mapping[str, np.ndarray],
+    extra: Mapping[str, np.ndarray],
     settings: MaskSettings,
-) -> ViewMasks:
-    """A view before and after the removal, with T as the paper defines it."""
-    raster = RasterSettings()
-    polygon = np.any([fill_polygon(p, camera.width, camera.height) for p in polygons], axis=0)
-    before, _ = surface_depth(gaussians, camera, raster)
-    after, alpha_after = surface_depth(kept, camera, raster)
-    weight = footprint(gaussians, camera, removed, raster)
-    silhouette = weight > settings.changed
-    occluder = _in_front(before, weight > 0.5, settings)
-    if settings.mode == "paper":
-        guards = np.any(
-            [
-                guard_gaussians(gaussians, ~removed & gaussians.usable, p, camera, settings.guard_scale)
-                for p in polygons
-            ],
-            axis=0,
-        )
-        covered = render(gaussians.take(guards), camera, raster, frozenset({"alpha"})).alpha
-        target = polygon & (covered <= settings.guard_footprint)
-    else:
-        target = silhouette
+) -> _Before:
+    size = (camera.height, camera.width)
+    photo, mask = photos.get(camera.id), extra.get(camera.id)
+    for kind, picture in (("photo", photo), ("extra mask", mask)):
+        if picture is not None and picture.shape[:2] != size:
+            raise BadInput(
+                f"masks: the {kind} of {camera.id} is {picture.shape[1]}×{picture.shape[0]}, not {size[1]}×{size[0]}"
+            )
+    depth, alpha = surface_depth(gaussians, camera)
+    window = window_round(np.concatenate(polygons), camera, settings.around)
+    agrees, likeness = np.ones(size, bool), np.nan
+    if photo is not None and not settings.selection.by_centre:
+        drawn = np.clip(render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb, 0, 1)
+        shown = photo[window] / np.float32(255)
+        misfit = np.abs(drawn - shown).max(-1)
+        limit = max(settings.selection.least_misfit, settings.selection.misfit * float(np.median(misfit)))
+        agrees[window], likeness = misfit <= limit, _correlation(drawn.mean(-1), shown.mean(-1))
+    return _Before(camera, polygons, window, depth, alpha, agrees, likeness, mask)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's; NaN where either is constant."""
+    a, b = a - a.mean(), b - b.mean()
+    spread = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / spread if spread > 1e-6 * a.size else np.nan
+
+
+def _choose(
+    gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
+) -> Selection:
+    """Which Gaussians go, by what the views show of them."""
+    depths = [(b.camera, b.depth) for b in before]
+    surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
+
+    def sighting(view: _Before) -> Sighting:
+        object_, ring = object_and_rim(view.camera, view.depth, region, surroundings, settings)
+        clear = view.agrees & ~object_ & ~ring
+        if view.extra is not None:
+            object_, clear = object_ & ~view.extra, clear & ~view.extra
+        return Sighting(view.camera, object_, clear, view.extra)
+
+    sightings = passes.over(sighting, before)
+    if not any(s.object_.sum() > settings.least_object * _polygon_pixels(b).sum() for s, b in zip(sightings, before)):
+        return by_centre(select_removed(gaussians, region))  # nothing stands out: the surface itself is meant
+    weights = weigh(gaussians, sightings)
+    selection = select(gaussians, region, weights, surroundings, settings)
+    if settings.support == 0:
+        return selection
+    revealed = weigh_revealed(gaussians, selection, sightings)
+    return without_revealed(gaussians, selection, region, weights.clear, revealed, settings)
+
+
+def _without(
+    gaussians: Gaussians,
+    kept: Gaussians,
+    gone: Gaussians,
+    removed: np.ndarray,  # [N] bool
+    view: _Before,
+    settings: MaskSettings,
+) -> _After:
+    """A view without the object; only the part that the object touched is drawn anew."""
+    window = gaussians_window(gone, view.camera, settings.around)
+    part = cropped(view.camera, window)
+    depth, alpha, weight = view.depth.copy(), view.alpha.copy(), np.zeros_like(view.alpha)
+    depth[window], alpha[window] = surface_depth(kept, part)
+    weight[window] = footprint(gaussians, part, removed)
+    return _After(depth, alpha, weight)
+
+
+def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels that are no evidence of what is behind the object."""
+    hidden = (after.weight > settings.hides) | ~before.agrees
+    return hidden if before.extra is None else hidden | before.extra
+
+
+def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1)."""
+    touched = after.weight > settings.changed
+    solid = touched & (after.alpha >= settings.solid)
+    window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
+    rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
+    evidence = touched & (after.alpha < settings.void)
+    evidence[rows, cols] = sight.shows(points, settings.depth_tolerance)
+    evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
+    return touched & ~evidence
+
+
+def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: _Before, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: T as the paper defines it, the polygon less the guard Gaussians' footprints."""
+    camera, usable = view.camera, ~removed & gaussians.usable
+    guards = [guard_gaussians(gaussians, usable, p, camera, settings.guard_scale) for p in view.polygons]
+    covered = render(gaussians.take(np.any(guards, axis=0)), camera, passes=frozenset({"alpha"})).alpha
+    return _polygon_pixels(view) & (covered <= settings.guard_footprint)
+
+
+def _polygon_pixels(view: _Before) -> np.ndarray:
+    return np.any([fill_polygon(p, view.camera.width, view.camera.height) for p in view.polygons], axis=0)
+
+
+def _view_masks(before: _Before, after: _After, needed: np.ndarray, mode: str, settings: MaskSettings) -> ViewMasks:
+    silhouette = after.weight > settings.changed
+    occluder = _in_front(before.depth, after.weight > 0.5, settings)
+    target = needed if mode == "paper" else _tidy(needed, silhouette, settings.margin)
+    target, depth = target & ~occluder, before.depth
+    if before.extra is not None:
+        target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(
-        camera,
-        polygon,
-        silhouette,
-        occluder,
-        target & ~occluder,
-        before,
-        after,
-        alpha_after,
+        before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, after.depth, after.alpha
     )
 
 
 def _in_front(depth: np.ndarray, object_: np.ndarray, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels at the object's outline whose first surface lies clearly in front of it, and their rim."""
     size = 2 * settings.margin + 1
-    nearest = cv2.erode(np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32), np.ones((size, size)))
+    object_depth = np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32)
+    nearest = cv2.erode(
+        object_depth, np.ones((size, size)), borderType=cv2.BORDER_REPLICATE
+    )  # its own border is finite
     front = ~object_ & (depth > 0) & (depth < (1 - settings.occluder_step) * np.where(np.isfinite(nearest), nearest, 0))
     return cv2.dilate(front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
-def _need_only(view: ViewMasks, views: Sequence[ViewMasks], settings: MaskSettings) -> ViewMasks:
-    """T without the pixels whose revealed surface some other view really saw (METHOD section 1, `ours`)."""
-    solid = view.silhouette & (view.alpha_after >= settings.solid) & (view.depth_after > 0)
-    rows, cols = np.nonzero(solid)
-    uv = np.stack([cols + 0.5, rows + 0.5], -1)
-    points = view.camera.unproject(uv, view.depth_after[rows, cols].astype(np.float64))
-    seen = np.zeros(len(points), dtype=bool)
-    for other in views:
-        if other is not view:
-            open_points = np.flatnonzero(~seen)
-            seen[open_points] = sees(other.camera, other.depth_before, points[open_points], settings.depth_tolerance)
-    evidence = np.zeros_like(view.silhouette)
-    evidence[rows[seen], cols[seen]] = True
-    evidence |= view.alpha_after < settings.void
-    target = view.silhouette & ~(evidence & _continues_outside(view, settings))
-    return replace(view, target=_tidy(target, view.silhouette, settings.margin) & ~view.occluder)
-
-
-def _continues_outside(view: ViewMasks, settings: MaskSettings) -> np.ndarray:
+def _continues_outside(
+    depth: np.ndarray,  # [H, W] z without the object, 0 = nothing
+    alpha: np.ndarray,  # [H, W]
+    touched: np.ndarray,  # [H, W] bool, by the object
+    settings: MaskSettings,
+) -> np.ndarray:
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
     by other views past the table's edge, but it is not what was behind the object.
     """
-    z = view.depth_after
-    void = view.alpha_after < settings.void
-    there = (z > 0) & (view.alpha_after >= settings.solid) | void
+    z, void = depth, alpha < settings.void
+    there = (z > 0) & (alpha >= settings.solid) | void
     index = np.arange(z.size).reshape(z.shape)
     pairs = []
     for near, far in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
@@ -316,7 +378,7 @@ def _continues_outside(view: ViewMasks, settings: MaskSettings) -> np.ndarray:
     graph = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (z.size, z.size))
     count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
     surface = surface.reshape(z.shape)
-    outside = np.bincount(surface[there & ~view.silhouette], minlength=count)
+    outside = np.bincount(surface[there & ~touched], minlength=count)
     return there & (outside[surface] >= settings.least_outside)
 
 

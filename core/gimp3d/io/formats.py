@@ -1,0 +1,299 @@
+"""Splat files other than plain PLY: PlayCanvas compressed PLY, .splat, .spz and .sog, each read into a `SplatFile`.
+
+All of them are lossy: what is read here is what their own viewers draw, in Inria's layout and axes. Told apart by
+content, so a wrong suffix does no harm.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadInput
+from ..gaussians import SH_C0, Gaussians
+from .ply import TYPES, SplatFile, file_of, header_of, read_ply
+
+SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+SPZ_MAGIC = b"NGSP"
+SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
+LARGEST_SPZ = 1 << 34  # bytes unpacked; more is a damaged header
+CHUNK_ROWS = 256  # Gaussians that share a chunk's bounds in a compressed PLY
+SQRT_HALF = np.sqrt(0.5)
+# Signs of SH coefficients 1 … 15 under a half turn about x: spz has y up and z back, Inria's files y down and z ahead
+HALF_TURN_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+
+
+def read_scene(path: Path | str) -> SplatFile:
+    """Read a splat scene of any kind: PLY (plain or compressed), .splat, .spz, .sog or an unpacked SOG folder.
+
+    Raises
+    ------
+    BadInput
+        If the file is missing, damaged or of no known kind, saying which.
+    """
+    path = Path(path)
+    try:
+        if path.is_dir() or path.name == "meta.json":
+            return file_of(_from_sog(_folder_reader(path if path.is_dir() else path.parent), path))
+        with path.open("rb") as f:
+            start = f.read(4)
+        if start[:3] == b"ply":
+            return file_of(_from_compressed_ply(path)) if _is_compressed(path) else read_ply(path)
+        if start == SPZ_MAGIC or start[:2] == b"\x1f\x8b":
+            return file_of(_from_spz(path))
+        if start == b"PK\x03\x04":
+            with zipfile.ZipFile(path) as archive:
+                return file_of(_from_sog(archive.read, path))
+        if path.suffix.lower() == ".splat":
+            return file_of(_from_splat(path))
+    except OSError as error:
+        raise BadInput(f"cannot read {path} ({error.strerror or error})") from None
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise BadInput(f"{path} is damaged ({error})") from None
+    raise BadInput(f"{path} is not a PLY, nor a .splat, .spz or .sog scene")
+
+
+def _from_splat(path: Path) -> Gaussians:
+    """antimatter15's .splat: 32 bytes per Gaussian, no SH."""
+    data = path.read_bytes()
+    if len(data) % SPLAT_ROW.itemsize:
+        raise BadInput(f"{path} is truncated: {len(data)} bytes are no whole number of 32-byte rows")
+    rows = np.frombuffer(data, SPLAT_ROW)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scales = np.log(rows["scale"])
+    return _gaussians(
+        rows["mean"],
+        log_scales,
+        (rows["quat"].astype(np.float32) - 128) / 128,
+        rows["rgba"][:, 3] / 255,
+        (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0,
+    )
+
+
+def _is_compressed(path: Path) -> bool:
+    return any(e.name == "chunk" for e in header_of(path).elements)
+
+
+def _from_compressed_ply(path: Path) -> Gaussians:
+    """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
+    header, data = header_of(path), path.read_bytes()
+    tables, offset = {}, header.size
+    for element in header.elements:
+        kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+        if offset + element.count * kind.itemsize > len(data):
+            raise BadInput(f"{path} is truncated: element {element.name} is not whole")
+        tables[element.name] = np.frombuffer(data, kind, element.count, offset)
+        offset += element.count * kind.itemsize
+    try:
+        vertex, bounds = tables["vertex"], tables["chunk"]
+        if len(bounds) * CHUNK_ROWS < len(vertex):
+            raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
+        chunk = np.arange(len(vertex)) // CHUNK_ROWS
+
+        def between(unit: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+            low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
+            return low + unit * (high - low)
+
+        means = between(_unpack(vertex["packed_position"], (21, 11, 0), (11, 10, 11)), ("x", "y", "z"))
+        log_scales = between(
+            _unpack(vertex["packed_scale"], (21, 11, 0), (11, 10, 11)), ("scale_x", "scale_y", "scale_z")
+        )
+        rgba = _unpack(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
+        rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
+        packed = vertex["packed_rotation"]
+        quats = _smallest_three(_unpack(packed, (20, 10, 0), (10, 10, 10)), (packed >> 30).astype(int))
+        rest, higher = tables.get("sh"), None
+        if rest is not None and rest.dtype.names:
+            steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
+            higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
+    except (KeyError, ValueError) as error:
+        raise BadInput(f"{path}: a damaged compressed PLY ({error})") from None
+    return _gaussians(means, log_scales, quats, rgba[:, 3], (rgb - 0.5) / SH_C0, higher, path)
+
+
+def _from_spz(path: Path) -> Gaussians:
+    """Niantic's .spz, versions 1 to 4 (4: zstd streams instead of one gzip)."""
+    data = path.read_bytes()
+    body = _unpacked_spz_4(data, path) if data[:4] == SPZ_MAGIC else gzip.decompress(data)
+    if len(body) < 16 or body[:4] != SPZ_MAGIC:
+        raise BadInput(f"{path} is a gzip file, but no .spz scene")
+    version, n, sh_degree, fraction_bits, flags = struct.unpack("<IIBBB", body[4:15])
+    if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS:
+        raise BadInput(f"{path}: .spz version {version} with SH degree {sh_degree} is not known")
+    offset = 16
+
+    def take(count: int, kind: str = "u1") -> np.ndarray:
+        nonlocal offset
+        size = count * np.dtype(kind).itemsize
+        if offset + size > len(body):
+            raise BadInput(f"{path} is truncated")
+        offset += size
+        return np.frombuffer(body, kind, count, offset - size)
+
+    if version == 1:
+        means = take(3 * n, "<f2").reshape(n, 3).astype(np.float64)
+    else:
+        low, middle, high = take(9 * n).reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
+        fixed = low | middle << 8 | high << 16
+        means = np.where(fixed & 0x800000, fixed - (1 << 24), fixed) / (1 << fraction_bits)
+    opacity = take(n) / 255
+    dc = (take(3 * n).reshape(n, 3) / 255 - 0.5) / 0.15
+    log_scales = take(3 * n).reshape(n, 3) / 16 - 10
+    if version >= 3:
+        quats = _spz_quats(take(4 * n).view("<u4"))
+    else:
+        xyz = take(3 * n).reshape(n, 3) / 127.5 - 1
+        quats = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
+    count = SPZ_SH_COUNTS[sh_degree]
+    higher = ((take(3 * count * n).reshape(n, count, 3).astype(np.float32) - 128) / 128) * HALF_TURN_SH[:count, None]
+    turned = quats * [1, 1, -1, -1]
+    return _gaussians(means * [1, -1, -1], log_scales, turned, opacity, dc, higher, path, bool(flags & 1))
+
+
+def _unpacked_spz_4(data: bytes, path: Path) -> bytes:
+    """The body that the streams of version 4 make up."""
+    try:
+        import zstandard
+    except ImportError:
+        raise BadInput(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard") from None
+    if len(data) < 20:
+        raise BadInput(f"{path} is truncated")
+    streams, table = data[15], struct.unpack("<I", data[16:20])[0]
+    offset = table + 16 * streams
+    if offset > len(data):
+        raise BadInput(f"{path} is truncated")
+    body = [data[:16]]
+    for packed, unpacked in struct.iter_unpack("<QQ", data[table:offset]):
+        if unpacked > LARGEST_SPZ:
+            raise BadInput(f"{path} is damaged: a stream of {unpacked} bytes")
+        try:
+            unpacker = zstandard.ZstdDecompressor()
+            body.append(unpacker.decompress(data[offset : offset + packed], max_output_size=unpacked))
+        except zstandard.ZstdError as error:
+            raise BadInput(f"{path} is damaged ({error})") from None
+        offset += packed
+    return b"".join(body)
+
+
+def _spz_quats(packed: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz [N, 4] from three components of 9 bits and a sign, in the order x, y, z, w."""
+    rest, largest = packed.astype(np.uint32), (packed >> 30).astype(int)
+    xyzw, squares = np.zeros((len(packed), 4)), np.zeros(len(packed))
+    for k in (3, 2, 1, 0):
+        stored = largest != k
+        size = (rest & 511) / 511 * SQRT_HALF
+        value = np.where(stored, np.where(rest >> 9 & 1, -size, size), 0)
+        xyzw[:, k] = value
+        squares += value**2
+        rest = np.where(stored, rest >> 10, rest)
+    xyzw[np.arange(len(packed)), largest] = np.sqrt(np.maximum(0, 1 - squares))
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _folder_reader(folder: Path) -> Callable[[str], bytes]:
+    return lambda name: (folder / Path(name).name).read_bytes()
+
+
+def _from_sog(read: Callable[[str], bytes], path: Path) -> Gaussians:
+    """PlayCanvas SOG, versions 1 and 2: attributes as lossless WebP pictures, described by meta.json."""
+    try:
+        meta: dict[str, Any] = json.loads(read("meta.json"))
+        version = int(meta.get("version", 1))
+        n = int(meta["count"] if version >= 2 else meta["means"]["shape"][0])
+
+        def pixels(part: str, file: int = 0) -> np.ndarray:
+            return _webp(read(meta[part]["files"][file]), path).reshape(-1, 4)[:n]
+
+        def decoded(part: str, values: np.ndarray) -> np.ndarray:
+            if "codebook" in meta[part]:
+                return np.array(meta[part]["codebook"], np.float64)[values]
+            low, high = np.array(meta[part]["mins"], np.float64), np.array(meta[part]["maxs"], np.float64)
+            return low + values / 255 * (high - low)
+
+        low, high = np.array(meta["means"]["mins"]), np.array(meta["means"]["maxs"])
+        fine, coarse = (pixels("means", k)[:, :3].astype(np.float64) for k in (0, 1))
+        logs = low + (fine + 256 * coarse) / 65535 * (high - low)
+        means = np.sign(logs) * np.expm1(np.abs(logs))
+        log_scales = decoded("scales", pixels("scales")[:, :3])
+        colour = pixels("sh0")
+        if version >= 2:
+            dc, opacity = decoded("sh0", colour[:, :3]), colour[:, 3] / 255
+        else:
+            rgba = decoded("sh0", colour)
+            dc, opacity = rgba[:, :3], 1 / (1 + np.exp(-rgba[:, 3]))
+        packed = pixels("quats")
+        quats = _smallest_three(packed[:, :3] / 255, packed[:, 3].astype(int) - 252)
+        higher = None
+        if "shN" in meta:
+            entries = _webp(read(meta["shN"]["files"][0]), path)
+            count = entries.shape[1] // 64
+            palette = decoded("shN", entries[..., :3].reshape(-1, count, 3))
+            labels = pixels("shN", 1).astype(int)
+            higher = palette[labels[:, 0] + 256 * labels[:, 1]]
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise BadInput(f"{path}: meta.json or a picture of the SOG scene is damaged ({error})") from None
+    return _gaussians(means, log_scales, quats, opacity, dc, higher, path)
+
+
+def _webp(data: bytes, path: Path) -> np.ndarray:
+    """A picture [H, W, 4] uint8, RGBA."""
+    try:
+        import cv2
+    except ImportError:
+        raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if picture is None or picture.ndim != 3:
+        raise BadInput(f"{path}: a picture of the SOG scene cannot be read")
+    if picture.shape[2] == 3:
+        return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
+    return cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA)
+
+
+def _unpack(packed: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> np.ndarray:
+    """Bit fields as numbers in [0, 1], [N, fields]."""
+    return np.stack([(packed >> s & ((1 << b) - 1)) / ((1 << b) - 1) for s, b in zip(shifts, bits)], 1)
+
+
+def _smallest_three(stored: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz [N, 4] from their three smaller components [N, 3] in [0, 1] and the number of the largest."""
+    if len(largest) and not 0 <= largest.min() <= largest.max() <= 3:
+        raise ValueError("a quaternion names no largest component")
+    small = (stored - 0.5) * 2 * SQRT_HALF
+    quats = np.empty((len(stored), 4))
+    for k in range(4):
+        rows = largest == k
+        quats[rows] = np.insert(small[rows], k, np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1))), axis=1)
+    return quats
+
+
+def _gaussians(
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    quats: np.ndarray,
+    opacity: np.ndarray,  # [N] in steps of 1/255
+    dc: np.ndarray,  # [N, 3]
+    higher: np.ndarray | None = None,  # [N, K, 3]
+    path: Path | str = "",
+    antialiased: bool = False,
+) -> Gaussians:
+    # 0 and 255 stand for what was rounded to them; their logits would be infinite.
+    alpha = np.clip(opacity, 0.25 / 255, 1 - 0.25 / 255)
+    sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
+    if sh.shape[1] not in (1, 4, 9, 16):
+        raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
+    return Gaussians(
+        means=np.ascontiguousarray(means, np.float32),
+        log_scales=np.maximum(log_scales, np.log(1e-9)).astype(np.float32),
+        quats=np.ascontiguousarray(quats, np.float32),
+        opacity_logits=np.log(alpha / (1 - alpha)).astype(np.float32),
+        sh=sh.astype(np.float32),
+        antialiased=antialiased,
+    )

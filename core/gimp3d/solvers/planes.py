@@ -1,0 +1,116 @@
+"""Planes in a disparity map. A plane in space is affine in disparity, d = a·u + b·v + c, whatever the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class PlaneSettings:
+    """Lengths in pixels; differences of disparity are relative to the disparity itself."""
+
+    ring: int = 24  # width of the ring on which planes are sought
+    inlier: float = 0.008  # difference up to which a ring pixel lies on a plane
+    most: int = 4  # a floor, two walls and a step
+    least: float = 0.08  # share of the ring that a plane must hold
+    tries: int = 256  # RANSAC samples per plane
+    junction: float = 0.95  # share of two planes' ring pixels that max or min must explain for them to meet
+    least_pixels: int = 10  # ring pixels below which no plane is sought
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A part of the background that planes describe: one, or some that meet in a line."""
+
+    disparity: np.ndarray  # [H, W] float64, continued over the whole image
+    on: np.ndarray  # [H, W] bool, the ring's pixels on it
+    planes: int = 1  # 0: the sky
+
+
+@dataclass(frozen=True)
+class PlanarSurfaces:
+    """What of the hole's surroundings is planar."""
+
+    surfaces: tuple[Surface, ...]
+    share: float  # of the ring that lies on them
+    reason: str
+
+
+def planar_surfaces(
+    disparity: np.ndarray,  # [H, W]; 0 = sky
+    known: np.ndarray,  # [H, W] bool
+    distance: np.ndarray,  # [H, W] px to the hole; 0 at pixels in the hole that are known all the same
+    settings: PlaneSettings = PlaneSettings(),
+) -> PlanarSurfaces:
+    """The planes on which the ring round the hole lies, largest first; sky is the plane d = 0.
+
+    Sequential RANSAC (Fischler & Bolles 1981) with a fixed seed, each plane refined by least squares. Only planes that
+    touch the hole count. Two that the ring shows to meet become one surface: the nearer one where they are concave (a
+    room seen from inside: max of disparities), the farther where convex (min). Two that do not, a step, stay two.
+    """
+    ring = known & (distance <= settings.ring)
+    rim = known & (distance < 2)
+    sky = ring & (disparity == 0)
+    left = ring & ~sky
+    rng = np.random.default_rng(0)
+    found = [Surface(np.zeros(disparity.shape), sky, 0)] if sky.any() else []
+    for _ in range(settings.most):
+        plane = _largest_plane(disparity, left, settings, rng)
+        if plane is None:
+            break
+        near = left & (np.abs(plane - disparity) < settings.inlier * disparity)
+        # Where a plane merely cuts through rough ground, its inliers are scattered.
+        inliers, candidates = (cv2.boxFilter(a.astype(np.float32), -1, (7, 7)) for a in (near, left))
+        on = near & (inliers > 0.6 * candidates)
+        left &= ~near
+        if on.sum() < settings.least * ring.sum():
+            break
+        found.append(Surface(plane, on))
+    share = float(sum(s.on.sum() for s in found) / max(1, ring.sum()))
+    planes = sum(s.planes for s in found)
+    reason = f"planar: {share:.0%} of the surroundings lie on {planes} plane{'s' if planes != 1 else ''}"
+    touching = [s for s in found if (s.on & rim).sum() > 0.03 * rim.sum()]
+    return PlanarSurfaces(tuple(_joined(touching, settings)), share, reason)
+
+
+def _largest_plane(
+    disparity: np.ndarray, ring: np.ndarray, settings: PlaneSettings, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The plane [H, W] that most ring pixels lie on."""
+    rows, cols = np.nonzero(ring)
+    if len(rows) < max(3, settings.least_pixels):
+        return None
+    # Divided by d, residuals are relative.
+    d = disparity[rows, cols]
+    points = np.stack([cols, rows, np.ones(len(rows))], -1) / d[:, None]
+    samples = rng.integers(0, len(rows), (settings.tries, 3))
+    solvable = np.abs(np.linalg.det(points[samples] * d[samples][..., None])) > 1.0  # not three pixels in a line
+    if not solvable.any():
+        return None
+    candidates = np.linalg.solve(points[samples[solvable]], np.ones((solvable.sum(), 3, 1)))[..., 0]
+    thinned = points[:: max(1, len(points) // 2000)]
+    votes = (np.abs(thinned @ candidates.T - 1) < settings.inlier).sum(0)
+    best = candidates[int(votes.argmax())]
+    for _ in range(3):
+        on = np.abs(points @ best - 1) < settings.inlier
+        if on.sum() < 3:
+            return None
+        best = np.linalg.lstsq(points[on], np.ones(on.sum()), rcond=None)[0]
+    v, u = np.mgrid[: ring.shape[0], : ring.shape[1]]
+    return best[0] * u + best[1] * v + best[2]
+
+
+def _joined(surfaces: list[Surface], settings: PlaneSettings) -> list[Surface]:
+    """The surfaces, with those that meet made one."""
+    for a, b in combinations(surfaces, 2):
+        for meet in (np.maximum, np.minimum):
+            joint = meet(a.disparity, b.disparity)
+            kept = [(np.abs(joint - s.disparity) <= settings.inlier * np.abs(s.disparity))[s.on].mean() for s in (a, b)]
+            if min(kept) >= settings.junction:
+                others = [s for s in surfaces if s is not a and s is not b]
+                return _joined([Surface(joint, a.on | b.on, a.planes + b.planes), *others], settings)
+    return surfaces

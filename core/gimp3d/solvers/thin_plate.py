@@ -1,0 +1,146 @@
+"""Thin plates: the smoothest continuation of scattered values, slopes and bends included.
+
+A membrane (Laplace's equation) is fixed at the rim and forgets how the surface came to it. A thin plate keeps the
+slope: on curved ground its error is a half to a quarter of a membrane's, measured on random scenes
+(`make bench-depth`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.linalg
+
+
+@dataclass(frozen=True)
+class ThinPlateSettings:
+    """How stiff the plate is."""
+
+    smoothing: float = 1.5  # px, σ below which the values' own noise is smoothed away
+    tension: float = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
+    unknowns: int = 4000  # at most; larger domains are solved on a coarser grid
+    stiff: float = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
+    outlier: float = 4.7  # standard deviations off the stiff plate at which a value does not count; inf: all count
+
+
+def thin_plate(
+    values: np.ndarray,  # [H, W]
+    weight: np.ndarray,  # [H, W] ≥ 0, how much each value counts; 0 = unknown
+    wanted: np.ndarray,  # [H, W] bool, where the surface is asked for
+    settings: ThinPlateSettings = ThinPlateSettings(),
+) -> np.ndarray:
+    """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
+
+    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²) over wanted pixels and those of weight > 0,
+    s the values' common slope (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a
+    sparse factorisation. Parts of the domain without a value are NaN.
+    """
+    wanted, weight = np.asarray(wanted, bool), np.asarray(weight, np.float64)
+    domain = wanted | (weight > 0)
+    result = np.full(domain.shape, np.nan)
+    if not (weight > 0).any():
+        return result
+    window = _window(domain)
+    domain, weight = domain[window], weight[window]
+    # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
+    trend = _slope(values[window], weight)
+    stride = int(np.ceil(np.sqrt(domain.sum() / settings.unknowns)))
+    count = _cells(weight, stride)
+    mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
+    cells = _cells(domain.astype(np.float64), stride) > 0
+    parts, _ = scipy.ndimage.label(cells)
+    cells &= np.isin(parts, parts[count > 0])
+    radius = max(np.sqrt(wanted.sum() / np.pi), 1.0)
+    pull = (settings.tension * radius / stride) ** -2
+    coarse, weights = np.full(cells.shape, np.nan), count
+    if np.isfinite(settings.outlier):
+        stiff = _energy(cells, settings.stiff**4 / stride**2, pull)
+        coarse[cells] = _minimum(stiff, count[cells], mean[cells])
+        weights = count * _biweight(coarse - mean, count > 0, settings.outlier)
+    coarse[cells] = _minimum(_energy(cells, settings.smoothing**4 / stride**2, pull), weights[cells], mean[cells])
+    fine = _refined(coarse, cells, stride)[: domain.shape[0], : domain.shape[1]]
+    inside = domain & np.repeat(np.repeat(cells, stride, 0), stride, 1)[: domain.shape[0], : domain.shape[1]]
+    result[window] = np.where(inside, fine + trend, np.nan)
+    return result
+
+
+def _window(domain: np.ndarray) -> tuple[slice, slice]:
+    rows, cols = np.flatnonzero(domain.any(1)), np.flatnonzero(domain.any(0))
+    return slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
+
+
+def _slope(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The plane [H, W] through the values, by least squares."""
+    rows, cols = np.nonzero(weight > 0)
+    share = np.sqrt(weight[rows, cols])
+    points = np.stack([rows, cols, np.ones(len(rows))], -1)
+    plane = np.linalg.lstsq(points * share[:, None], values[rows, cols] * share, rcond=None)[0]
+    y, x = np.indices(values.shape)
+    return plane[0] * y + plane[1] * x + plane[2]
+
+
+def _cells(values: np.ndarray, stride: int) -> np.ndarray:
+    """Sums over cells of stride × stride pixels."""
+    h, w = (-(-n // stride) for n in values.shape)
+    padded = np.pad(values, ((0, h * stride - values.shape[0]), (0, w * stride - values.shape[1])))
+    return padded.reshape(h, stride, w, stride).sum((1, 3))
+
+
+def _energy(cells: np.ndarray, stiffness: float, tension: float) -> scipy.sparse.csr_matrix:
+    """The matrix [n, n] of the bending energy; differences that leave the domain are dropped (natural boundary)."""
+    index = np.where(cells, np.cumsum(cells).reshape(cells.shape) - 1, -1)
+    h, w = cells.shape
+    n = int(cells.sum())
+    energy = scipy.sparse.csr_matrix((n, n))
+    for share, stencil in (
+        (1.0, {(0, 0): 1, (0, 1): -2, (0, 2): 1}),
+        (1.0, {(0, 0): 1, (1, 0): -2, (2, 0): 1}),
+        (2.0, {(0, 0): 1, (0, 1): -1, (1, 0): -1, (1, 1): 1}),
+        (tension, {(0, 0): -1, (0, 1): 1}),
+        (tension, {(0, 0): -1, (1, 0): 1}),
+    ):
+        down, right = max(y for y, _ in stencil), max(x for _, x in stencil)
+        if h <= down or w <= right:
+            continue
+        taken = np.stack([index[y : h - down + y, x : w - right + x].ravel() for y, x in stencil])
+        taken = taken[:, (taken >= 0).all(0)]
+        rows = np.broadcast_to(np.arange(taken.shape[1]), taken.shape)
+        factors = np.repeat(np.sqrt(stiffness * share) * np.array(list(stencil.values()), float), taken.shape[1])
+        difference = scipy.sparse.csr_matrix((factors, (rows.ravel(), taken.ravel())), (taken.shape[1], n))
+        energy = energy + difference.T @ difference
+    return energy
+
+
+def _minimum(energy: scipy.sparse.csr_matrix, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    system = (energy + scipy.sparse.diags(weight)).tocsc()
+    factors = scipy.sparse.linalg.splu(
+        system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return factors.solve(weight * values)
+
+
+def _biweight(residual: np.ndarray, there: np.ndarray, outlier: float) -> np.ndarray:
+    """Tukey's weights of the residuals (95 % efficient at 4.7); never 0, lest a part of the domain lose all."""
+    scale = 1.4826 * float(np.median(np.abs(residual[there])))
+    share = np.where(there, np.abs(residual), 0.0) / (outlier * scale + 1e-300)
+    return np.maximum(1 - np.minimum(share, 1.0) ** 2, 1e-3) ** 2
+
+
+def _refined(coarse: np.ndarray, cells: np.ndarray, stride: int) -> np.ndarray:
+    """Bicubic, from cells to pixels."""
+    if stride == 1:
+        return coarse
+    nearest = scipy.ndimage.distance_transform_edt(~cells, return_distances=False, return_indices=True)
+    h, w = coarse.shape
+    scale, shift = 1 / stride, 0.5 / stride - 0.5
+    return cv2.warpAffine(
+        coarse[tuple(nearest)],
+        np.array([[scale, 0, shift], [0, scale, shift]]),
+        (w * stride, h * stride),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )

@@ -1,0 +1,207 @@
+"""What other views measured of the surface behind the object, and what they see past (METHOD section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from ..threads import parallel_map
+from .layers import steps
+from .masks import ViewMasks
+
+
+@dataclass(frozen=True)
+class DepthEvidenceSettings:
+    """Depths and disparities relative, lengths in pixels."""
+
+    unchanged: float = 0.01  # a view sees the background where removing the object moves its first surface by less
+    solid: float = 0.9  # alpha from which a surface counts as there
+    margin: int = 1  # px kept from what does not count
+    step: float = 0.06  # a depth edge: which pixel has which depth is not certain there
+    agreement: float = 0.03  # samples of one pixel that lie closer are of one surface
+    least_views: int = 2  # that must agree on a surface, or on there being none
+    full: int = 4  # views that make a pixel as sure as one of the reference's own
+    beyond: float = 0.03  # how far behind a point a view must see to see past it
+    far: float = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
+    coarse: int = 4  # stride at which it is asked which parts of a view may show the hole
+    push: float = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
+    pushes: int = 40  # at most: to 50 times the distance
+
+
+@dataclass(frozen=True)
+class DepthEvidence:
+    """Soft data in the reference's hole."""
+
+    disparity: np.ndarray  # [H, W] float32, 0 = none
+    weight: np.ndarray  # [H, W] float32 in [0, 1], 0 = none
+
+
+def gather_depth_evidence(
+    view: ViewMasks,  # the reference
+    views: Sequence[ViewMasks],  # the others; the reference among them does not count
+    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+) -> DepthEvidence:
+    """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
+
+    Taken are the pixels of other views whose first surface is there with and without the object, off depth edges. They
+    are carried into the reference; the samples of a pixel fall into groups that agree, and the nearest group of enough
+    views gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
+    """
+    others = [v for v in views if v.camera.id != view.camera.id]
+    samples = parallel_map(lambda v: _samples(v, view, settings), others)
+    h, w = view.target.shape
+    found, count = np.zeros(h * w), np.zeros(h * w)
+    pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
+    origin = np.repeat(np.arange(len(samples)), [s.shape[1] for s in samples])
+    if len(pixels):
+        order = np.lexsort((-disparities, pixels))
+        pixels, disparities, origin = pixels[order].astype(int), disparities[order], origin[order]
+        apart = (np.diff(pixels) > 0) | (disparities[1:] < (1 - settings.agreement) * disparities[:-1])
+        start = np.flatnonzero(np.r_[True, apart])
+        group = np.cumsum(np.r_[0, apart])
+        agreeing = np.bincount(np.unique(group * len(samples) + origin) // len(samples), minlength=len(start))
+        middle = disparities[start + np.bincount(group) // 2]
+        enough = agreeing >= settings.least_views
+        taken, first = np.unique(pixels[start[enough]], return_index=True)
+        found[taken], count[taken] = middle[enough][first], agreeing[enough][first]
+    found, count = found.reshape(h, w), count.reshape(h, w)
+    nearest = cv2.dilate(found, np.ones((5, 5), np.uint8))
+    count[found < (1 - settings.step) * nearest] = 0
+    weight = np.minimum(count / settings.full, 1)
+    return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
+
+
+def _samples(other: ViewMasks, view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
+    """[2, M]: pixels of the reference's hole (flat indices) and the disparities that a view measured there."""
+    width = view.target.shape[1]
+    rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))
+    points = other.camera.unproject(
+        np.stack([cols + 0.5, rows + 0.5], -1), other.depth_before[rows, cols].astype(float)
+    )
+    _, cols, rows, z = _framed(view.camera, points)
+    front = view.depth_before[rows, cols]  # nothing of the background lies before what the reference itself sees
+    there = view.target[rows, cols] & (z > (1 - settings.beyond) * front)
+    return np.stack([rows[there] * width + cols[there], 1 / z[there]])
+
+
+def _may_reach(other: ViewMasks, view: ViewMasks, stride: int) -> np.ndarray:
+    """[H, W] bool: blocks of a view that may show something of the reference's hole; most do not, which saves time."""
+    coarse = other.depth_before[stride // 2 :: stride, stride // 2 :: stride]
+    rows, cols = np.nonzero(coarse > 0)
+    uv = (np.stack([cols, rows], -1) + 0.5) * stride
+    inside, x, y, _ = _framed(view.camera, other.camera.unproject(uv, coarse[rows, cols].astype(float)))
+    near_hole = cv2.dilate(view.target.astype(np.uint8), np.ones((8 * stride + 1,) * 2, np.uint8)) > 0
+    found = np.zeros(coarse.shape, np.uint8)
+    found[rows[inside], cols[inside]] = near_hole[y, x]
+    found = cv2.dilate(found, np.ones((3, 3), np.uint8))
+    return (
+        np.kron(np.pad(found, ((0, 1), (0, 1)), "edge"), np.ones((stride, stride), np.uint8))[
+            : other.target.shape[0], : other.target.shape[1]
+        ]
+        > 0
+    )
+
+
+def _background(view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface is not the object's, off depth edges."""
+    depth = view.depth_before
+    there = (depth > 0) & (view.alpha_after > settings.solid)
+    same = there & (np.abs(view.depth_after - depth) <= settings.unchanged * depth)
+    disparity = np.divide(1, depth, out=np.zeros_like(depth), where=there)
+    doubtful = there & ~same | steps(disparity, there, settings.step)
+    return same & (cv2.dilate(doubtful.astype(np.uint8), np.ones((2 * settings.margin + 1,) * 2, np.uint8)) == 0)
+
+
+def _framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(indices, cols, rows, z) of the points that lie in a view's frame."""
+    uv, z = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+    cols, rows = uv[inside].astype(int).T
+    return np.flatnonzero(inside), cols, rows, z[inside]
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Where views see through: no surface of the background can stand there."""
+
+    view: ViewMasks  # the reference
+    others: tuple[tuple[Camera, np.ndarray, np.ndarray], ...]  # camera, nearest and farthest z round each pixel
+    margin: int  # views by which those that see past must outnumber those that see a surface
+    settings: DepthEvidenceSettings
+
+    def seen_past(
+        self,
+        depth: np.ndarray,  # [H, W] completed z-depth
+        pixels: np.ndarray,  # [H, W] bool, those asked about
+    ) -> np.ndarray:
+        """[H, W] bool: pixels whose completed surface stands where views see through.
+
+        The reference sees the object, and nothing in front of it. Another view sees past a point if all it sees round
+        its pixel lies clearly behind; enough others must. Where a view sees nothing (alpha below ½), it says nothing.
+        """
+        rows, cols = np.nonzero(pixels & (depth > 0))
+        past, excess = self._votes(depth, rows, cols)
+        view, tolerance = self.view, 1 - self.settings.beyond
+        object_there = (view.depth_after <= 0) | (view.depth_before < tolerance * view.depth_after)
+        before_object = (depth < tolerance * view.depth_before) & (depth > self.settings.far * view.depth_before)
+        found = np.zeros(pixels.shape, bool)
+        found[rows, cols] = (past >= self.settings.least_views) & (excess > self.margin)
+        return found | (before_object & object_there & pixels & (depth > 0))
+
+    def pushed_back(
+        self,
+        depth: np.ndarray,  # [H, W] completed z-depth
+        contradicted: np.ndarray,  # [H, W] bool
+    ) -> np.ndarray:
+        """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
+
+        0 elsewhere, and where there is no such place within reach.
+        """
+        moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
+        for k in range(self.settings.pushes):
+            if not left.any():
+                break
+            moved = np.where(left, moved * (1 + self.settings.push * 1.1**k), moved)
+            left = self.seen_past(moved, left)
+        return np.where(left, 0.0, moved).astype(np.float32)
+
+    def _votes(self, depth: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Per pixel: the other views that see past it, and by how many more they are than those that see it."""
+        uv = np.stack([cols + 0.5, rows + 0.5], -1)
+        points = self.view.camera.unproject(uv, depth[rows, cols].astype(np.float64))
+        past, there = np.zeros(len(points), int), np.zeros(len(points), int)
+        for camera, nearest, farthest in self.others:
+            index, x, y, z = _framed(camera, points)
+            near, far = nearest[y, x], farthest[y, x]
+            past[index] += near > (1 + self.settings.beyond) * z
+            there[index] += (near <= (1 + self.settings.beyond) * z) & (far >= (1 - self.settings.beyond) * z)
+        return past, past - there
+
+
+def free_space(
+    view: ViewMasks,  # the reference
+    views: Sequence[ViewMasks],
+    trusted: np.ndarray,  # [H, W] bool, the reference's own surfaces: what views say of them shows how far to trust it
+    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+) -> FreeSpace:
+    """What other views see through. The margin is what 95 % of the reference's own surfaces stay below.
+
+    In scans with poor depths, views "see past" tables; they must then say so more clearly of the hole than of these.
+    """
+    around = np.ones((3, 3), np.uint8)
+    others = tuple(
+        (v.camera, cv2.erode(v.depth_before, around), cv2.dilate(v.depth_before, around))  # nearest 0: void is near
+        for v in views
+        if v.camera.id != view.camera.id
+    )
+    space = FreeSpace(view, others, 0, settings)
+    rows, cols = np.nonzero(trusted & (view.depth_after > 0))
+    if len(rows) == 0:
+        return space
+    excess = space._votes(view.depth_after, rows, cols)[1]
+    return replace(space, margin=max(0, int(np.percentile(excess, 95))))

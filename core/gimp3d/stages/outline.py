@@ -1,0 +1,141 @@
+"""Where things lie in a view: a box's outline, the window that holds it, and that part of the view as a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ..box import Box
+from ..camera import Camera
+from ..gaussians import Gaussians
+
+EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
+Window = tuple[slice, slice]  # rows and columns of a picture
+
+
+def box_polygon(
+    box: Box,
+    camera: Camera,
+    near: float,  # z below which the box is cut away, scene units
+) -> np.ndarray | None:
+    """The convex outline of a box in a view, [M, 2] pixels, clipped against the near plane before projecting.
+
+    None if nothing of the box lies in front of the camera.
+    """
+    points = camera.to_camera(box.corners())
+    in_front = points[:, 2] >= near
+    visible = [points[in_front]]
+    for a, b in EDGES:
+        if in_front[a] != in_front[b]:
+            s = (near - points[a, 2]) / (points[b, 2] - points[a, 2])
+            visible.append((points[a] + s * (points[b] - points[a]))[None])
+    cut = np.concatenate(visible)
+    if len(cut) < 3:
+        return None
+    uv = cut[:, :2] / cut[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    hull = cv2.convexHull(uv.astype(np.float32))[:, 0]
+    return hull if len(hull) >= 3 else None
+
+
+def fill_polygon(
+    polygon: np.ndarray,  # [M, 2] convex, pixels
+    width: int,
+    height: int,
+) -> np.ndarray:
+    """[H, W] bool: pixels whose centre lies inside a convex polygon of either orientation."""
+    mask = np.zeros((height, width), dtype=bool)
+    low = np.clip(np.floor(polygon.min(0)), 0, [width, height]).astype(int)
+    high = np.clip(np.ceil(polygon.max(0)), 0, [width, height]).astype(int)
+    if (high <= low).any():
+        return mask
+    x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
+    start, end = polygon.astype(np.float64), np.roll(polygon.astype(np.float64), -1, axis=0)
+    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(start, end)]
+    inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
+    mask[low[1] : high[1], low[0] : high[0]] = inside
+    return mask
+
+
+def guard_gaussians(
+    gaussians: Gaussians,
+    candidates: np.ndarray,  # [N] bool, the kept ones
+    polygon: np.ndarray,  # [M, 2]
+    camera: Camera,
+    scale: float,
+) -> np.ndarray:
+    """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
+    uv, _ = camera.project(gaussians.means.astype(np.float64))
+    centre = polygon.mean(0)
+
+    def inside(outline: np.ndarray) -> np.ndarray:
+        rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
+        start, end = outline, np.roll(outline, -1, axis=0)
+        u, v = uv[rows, 0, None], uv[rows, 1, None]
+        side = (end - start)[:, 0] * (v - start[:, 1]) - (end - start)[:, 1] * (u - start[:, 0])
+        result = np.zeros(len(uv), dtype=bool)
+        result[rows] = (side >= 0).all(1) | (side <= 0).all(1)
+        return result
+
+    return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
+
+
+def window_round(
+    points: np.ndarray,  # [N, 2] pixels
+    camera: Camera,
+    margin: int = 0,  # pixels
+) -> Window:
+    """The rectangle round the points and a margin, within the picture; never empty."""
+    size = np.array([camera.width, camera.height])
+    ends = [points.min(0), points.max(0)] if len(points) else [size / 2, size / 2]
+    low = np.clip(np.floor(ends[0]) - margin, 0, size - 1).astype(int)
+    high = np.clip(np.ceil(ends[1]) + margin, low + 1, size).astype(int)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def box_window(box: Box, camera: Camera) -> Window:
+    """The rectangle that holds a box; the whole picture if the box reaches behind the camera."""
+    corners = box.corners()
+    if (camera.to_camera(corners)[:, 2] <= 0).any():
+        return slice(0, camera.height), slice(0, camera.width)
+    return window_round(camera.project(corners)[0], camera, 1)
+
+
+def gaussians_window(gaussians: Gaussians, camera: Camera, margin: int) -> Window:
+    """The rectangle round all that Gaussians can touch; the whole picture if one reaches behind the camera."""
+    usable = gaussians.usable
+    centres = camera.to_camera(gaussians.means[usable].astype(np.float64))
+    reach = 3.5 * gaussians.scales[usable].max(1)[:, None]  # alpha is below 1/255 from 3.33 standard deviations on
+    before = centres[:, 2:] + reach > 0
+    centres, reach = centres[before[:, 0]], reach[before[:, 0]]
+    near, far = centres[:, 2:] - reach, centres[:, 2:] + reach
+    if (near <= 0).any():
+        return slice(0, camera.height), slice(0, camera.width)
+    low, high = centres[:, :2] - reach, centres[:, :2] + reach
+    ends = np.concatenate([low / near, low / far, high / near, high / far])
+    return window_round(ends * [camera.fx, camera.fy] + [camera.cx, camera.cy], camera, margin)
+
+
+def cropped(camera: Camera, window: Window) -> Camera:
+    """The part of a view in a window, with exact intrinsics."""
+    rows, cols = window
+    return replace(
+        camera,
+        width=cols.stop - cols.start,
+        height=rows.stop - rows.start,
+        cx=camera.cx - cols.start,
+        cy=camera.cy - rows.start,
+    )
+
+
+def surface_points(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z, 0 = nothing
+    window: Window,
+    step: int = 1,  # only every step-th row and column
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [N], columns [N] and scene points [N, 3] of the pixels in a window that show a surface."""
+    rows, cols = np.nonzero(depth[window][::step, ::step] > 0)
+    rows, cols = step * rows + window[0].start, step * cols + window[1].start
+    return rows, cols, camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))

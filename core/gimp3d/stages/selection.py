@@ -1,0 +1,270 @@
+"""Which Gaussians go: the object in the user's boxes, not the floor that they cut into (METHOD section 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from scipy.special import ndtri
+
+from ..box import Region, in_region
+from ..camera import Camera
+from ..gaussians import Gaussians, quats_to_matrices
+from ..raster import contributions
+from ..threads import parallel_map
+from .outline import box_window, surface_points
+from .surroundings import Surroundings, SurroundingsSettings
+
+PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
+
+
+class Fate(IntEnum):
+    """What becomes of a Gaussian and why; from REMOVED_INSIDE on it goes."""
+
+    OUTSIDE = 0  # stays: does not reach the region, or cannot be drawn
+    KEPT_STRADDLING = 1  # stays: reaches in, but shows elsewhere
+    KEPT_LARGE = 2  # stays: its centre lies inside, but it is as large as the region and shows elsewhere
+    KEPT_SURFACE = 3  # stays: inside, but seen unhidden on surface that runs on from outside
+    REMOVED_INSIDE = 4  # goes: inside
+    REMOVED_STRADDLING = 5  # goes: reaches in and shows on the object
+    REMOVED_REVEALED = 6  # goes: near, and only the removal would show it
+    REMOVED_MASKED = 7  # goes: shows under the extra masks
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """What counts as the object. Weights are blend weights, summed over pixels and views."""
+
+    by_centre: bool = False  # the paper's rule: nothing but centres in the region counts
+    straddle: float = 0.02  # share of a Gaussian's mass in the region from which it reaches in
+    mostly: float = 0.5  # share of its mass, or of its weight, that decides
+    slack: float = 1.0  # how far outside the boxes surface may still be the object's, cells of the surroundings
+    rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
+    large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
+    shown: float = 0.5  # weight below which a Gaussian shows nothing
+    support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
+    least_object: float = 0.002  # share of the region's outline that the object fills in some view, else all goes
+    near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
+    misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
+    least_misfit: float = 0.1  # … and by so much, colours in [0, 1]
+    surroundings: SurroundingsSettings = SurroundingsSettings()
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Every Gaussian's fate."""
+
+    fates: np.ndarray  # [N] uint8, see Fate
+
+    @property
+    def removed(self) -> np.ndarray:
+        """[N] bool."""
+        return self.fates >= Fate.REMOVED_INSIDE
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {f.name.lower(): self.count(f) for f in Fate if f != Fate.OUTSIDE}
+
+    def count(self, fate: Fate) -> int:
+        return int((self.fates == fate).sum())
+
+    @property
+    def words(self) -> str:
+        """What went and what stayed, for people."""
+        gone = [
+            f"{self.count(Fate.REMOVED_INSIDE)} inside",
+            f"{self.count(Fate.REMOVED_STRADDLING)} straddlers",
+            f"{self.count(Fate.REMOVED_REVEALED)} that only the removal would show",
+            f"{self.count(Fate.REMOVED_MASKED)} under extra masks",
+        ]
+        stay = [
+            f"{self.count(Fate.KEPT_SURFACE)} of floor or wall",
+            f"{self.count(Fate.KEPT_STRADDLING)} straddlers",
+            f"{self.count(Fate.KEPT_LARGE)} large ones",
+        ]
+        parts = [", ".join(p for p in part if not p.startswith("0 ")) or "none" for part in (gone, stay)]
+        return f"{int(self.removed.sum())} Gaussians go ({parts[0]}), in the region stay {parts[1]}"
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What a view shows of the scene with the object, for the selection; masks are [H, W] bool."""
+
+    camera: Camera
+    object_: np.ndarray  # the first surface is the object
+    clear: np.ndarray  # it is something else, not at the object's rim, and the photo agrees
+    extra: np.ndarray | None  # the user's extra mask, if there is one for this view
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Each Gaussian's blend weight summed over pixels and views, with the object in place; all [N]."""
+
+    object_: np.ndarray
+    clear: np.ndarray
+    masked: np.ndarray  # under extra masks …
+    unmasked: np.ndarray  # … and beside them, in the views that have one
+
+
+def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
+    """[N] bool: Gaussians whose centre lies in the region. Unusable rows are never removed."""
+    return in_region(region, gaussians.means.astype(np.float64)) & gaussians.usable
+
+
+def by_centre(
+    inside: np.ndarray,  # [N] bool, see select_removed
+) -> Selection:
+    """The paper's rule."""
+    return Selection(np.where(inside, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
+
+
+def object_and_rim(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z with the object, 0 = nothing
+    region: Region,
+    surroundings: Sequence[Surroundings],
+    settings: SelectionSettings = SelectionSettings(),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels whose first surface lies in the region and is not the surroundings', and the ring round them.
+
+    Both [H, W] bool. In the ring the colours of splats that stand where the object meets the floor run together.
+    """
+    found = np.zeros(depth.shape, np.uint8)
+    cell = max(part.cell for part in surroundings)
+    for box in region:
+        grown = replace(box, size=box.size + 2 * settings.slack * cell)
+        rows, cols, points = surface_points(camera, depth, box_window(grown, camera))
+        inside = np.flatnonzero(grown.contains(points))
+        for part in surroundings:
+            inside = inside[part.distance(points[inside]) > settings.surroundings.thickness * part.cell]
+        found[rows[inside], cols[inside]] = 1
+    found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    if not found.any():
+        return found > 0, found > 0
+    distance = float(np.median(depth[found > 0]))
+    width = max(1, round(camera.fx * settings.rim * cell / distance))
+    grown = cv2.dilate(found, np.ones((2 * width + 1,) * 2, np.uint8))
+    return found > 0, grown > found
+
+
+def weigh(gaussians: Gaussians, sightings: Sequence[Sighting]) -> Weights:
+    """Where each Gaussian shows while the object is there: two passes per view, three with an extra mask."""
+
+    def of(view: Sighting) -> list[np.ndarray]:
+        object_ = contributions(gaussians, view.camera, pixels=view.object_).total
+        clear = contributions(gaussians, view.camera, pixels=view.clear).total
+        if view.extra is None:
+            return [object_, clear]
+        return [object_, clear, contributions(gaussians, view.camera, pixels=view.extra).total, object_ + clear]
+
+    sums = np.zeros((4, len(gaussians)))
+    for parts in parallel_map(of, sightings):
+        for total, part in zip(sums, parts):
+            total += part
+    return Weights(*sums)
+
+
+def select(
+    gaussians: Gaussians,
+    region: Region,
+    weights: Weights,
+    surroundings: Sequence[Surroundings],
+    settings: SelectionSettings = SelectionSettings(),
+) -> Selection:
+    """Every Gaussian's fate from where it lies and where it shows.
+
+    Inside: mass mostly in the region; it goes unless it shows cleanly on surface that runs on from outside.
+    Straddling: the rest of what reaches in; it goes if it shows mostly on the object, so that neither a halo is left
+    nor a black hole opened. What shows nowhere is judged by its centre.
+    """
+    shown = weights.object_ + weights.clear
+    on_object = weights.object_ / np.maximum(shown, 1e-9)
+    visible = shown > settings.shown
+    centre = select_removed(gaussians, region)
+    rows = np.flatnonzero(_reaches(gaussians, region) & gaussians.usable)
+    mass = np.zeros(len(gaussians))
+    mass[rows] = mass_inside(gaussians, rows, region)
+    fates = np.zeros(len(gaussians), np.uint8)
+    straddling = ~centre & (mass >= settings.straddle)
+    fates[straddling] = Fate.KEPT_STRADDLING
+    fates[straddling & visible & (on_object > settings.mostly)] = Fate.REMOVED_STRADDLING
+    fates[centre] = Fate.REMOVED_INSIDE
+    elsewhere = centre & (mass < settings.mostly) & visible & (on_object <= settings.mostly)
+    large = gaussians.scales.max(1) > settings.large * min(box.size.min() for box in region)
+    fates[elsewhere] = np.where(large[elsewhere], Fate.KEPT_LARGE, Fate.KEPT_STRADDLING)
+    inside = np.flatnonzero(fates == Fate.REMOVED_INSIDE)
+    clean = visible[inside] & (on_object[inside] <= settings.mostly)
+    for part in surroundings:
+        surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
+        fates[inside[surface & clean]] = Fate.KEPT_SURFACE
+    under_masks = weights.masked > np.maximum(settings.shown, settings.mostly * (weights.masked + weights.unmasked))
+    fates[under_masks & gaussians.usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
+    return Selection(fates)
+
+
+def weigh_revealed(gaussians: Gaussians, selection: Selection, sightings: Sequence[Sighting]) -> np.ndarray:
+    """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views."""
+    stays = ~selection.removed
+    kept = gaussians.take(stays)
+    total = np.zeros(len(gaussians))
+    for part in parallel_map(lambda s: contributions(kept, s.camera, pixels=s.object_).total, sightings):
+        total[stays] += part
+    return total
+
+
+def without_revealed(
+    gaussians: Gaussians,
+    selection: Selection,
+    region: Region,
+    clear: np.ndarray,  # [N] weight on what views showed unhidden, with the object in place
+    revealed: np.ndarray,  # [N], see weigh_revealed
+    settings: SelectionSettings = SelectionSettings(),
+) -> Selection:
+    """Remove what the removal reveals near the region and no photo vouches for (METHOD section 1, contamination).
+
+    Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them.
+    """
+    near = np.zeros(len(gaussians), bool)
+    for box in region:
+        local = (gaussians.means - box.center) @ box.axes
+        near |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
+    found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
+    return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
+
+
+def mass_inside(
+    gaussians: Gaussians,
+    rows: np.ndarray,  # [M] indices of usable rows
+    region: Region,
+    samples: int = 128,
+) -> np.ndarray:
+    """[M]: the share of each Gaussian's integral that lies in the region.
+
+    Quasi-Monte Carlo over an additive recurrence with the generalised golden ratio (Roberts 2018).
+    """
+    uniform = (0.5 + np.outer(np.arange(samples), PLASTIC ** -np.arange(1.0, 4.0))) % 1
+    normal = ndtri(uniform)
+    inside = np.empty(len(rows))
+    for start in range(0, len(rows), 4096):
+        part = rows[start : start + 4096]
+        scales = gaussians.scales[part].astype(np.float64)
+        axes = quats_to_matrices(gaussians.quats[part].astype(np.float64))[:, :, : scales.shape[1]]
+        points = (
+            np.einsum("mik,mk,sk->msi", axes, scales, normal[:, : scales.shape[1]]) + gaussians.means[part][:, None]
+        )
+        inside[start : start + 4096] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
+    return inside
+
+
+def _reaches(gaussians: Gaussians, region: Region) -> np.ndarray:
+    """[N] bool: within three standard deviations of a box."""
+    longest = gaussians.scales.max(1)
+    found = np.zeros(len(gaussians), bool)
+    for box in region:
+        beyond = np.maximum(np.abs((gaussians.means - box.center) @ box.axes) - box.size / 2, 0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found |= (beyond**2).sum(1) <= (3 * longest) ** 2
+    return found

@@ -1,0 +1,191 @@
+"""Floor and walls inside a user's box: surface that runs on smoothly from outside it (METHOD section 1).
+
+The views' depth maps are gathered as points in small cells round the box. Growth starts where the surface leaves the
+cells, well outside the box, and goes on to a neighbouring cell if that lies in the plane of what was reached before it.
+At the crease where an object stands it stops.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+
+from ..box import Box, Region, in_region
+from ..camera import Camera
+from ..jit import exact_kernel
+from ..threads import parallel_map
+from .outline import box_window, surface_points
+
+SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix
+
+
+@dataclass(frozen=True)
+class SurroundingsSettings:
+    """How surface is followed into a box. Lengths in cells unless said otherwise."""
+
+    cells: int = 800_000  # of the grid round one box at most
+    least_cell: float = 1.5  # edge of a cell, pixels of a usual view
+    least_points: int = 3  # in a cell that counts as surface
+    beyond: float = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
+    seeds: float = 0.1  # width of the grid's outer layer, where growth starts, as such a share
+    views: int = 60  # at most so many, spread evenly, are gathered
+    step: float = 0.6  # how far a cell may lie off the plane of those reached before it
+    turn: float = 50.0  # degrees that its normal may differ from theirs
+    steady: float = 20.0  # degrees up to which a cell's own normal bends the plane that it hands on …
+    adapt: float = 0.25  # … and with what weight
+    support: int = 4  # cells within two that must have been reached before
+    thickness: float = 0.5  # how far off its plane a point still belongs to the surface
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The surface that was followed into a box; all in the box's axes, from its centre."""
+
+    box: Box
+    half: np.ndarray  # [3] half the grid's size
+    cell: float  # edge length of a cell, scene units
+    nearest: np.ndarray  # grid of int32: the row of the nearest cell of the surface, −1 beyond two cells
+    points: np.ndarray  # [M, 3] on the surface
+    normals: np.ndarray  # [M, 3] unit
+
+    def distance(
+        self,
+        points: np.ndarray,  # [N, 3] scene coordinates
+    ) -> np.ndarray:
+        """[N]: how far points lie off the surface's plane nearby, in scene units; infinite where there is none."""
+        with np.errstate(invalid="ignore"):
+            local = (points - self.box.center) @ self.box.axes
+            index = np.floor((local + self.half) / self.cell)
+            inside = ((index >= 0) & (index < self.nearest.shape)).all(1)
+        rows = np.full(len(points), -1, np.int32)
+        rows[inside] = self.nearest[tuple(index[inside].astype(int).T)]
+        found = rows >= 0
+        distance = np.full(len(points), np.inf)
+        distance[found] = np.abs(((local[found] - self.points[rows[found]]) * self.normals[rows[found]]).sum(1))
+        return distance
+
+
+def follow_surroundings(
+    box: Box,
+    region: Region,  # where growth cannot start
+    views: Sequence[tuple[Camera, np.ndarray]],  # (camera, z-depth [H, W] with the object, 0 = nothing)
+    settings: SurroundingsSettings = SurroundingsSettings(),
+) -> Surroundings:
+    """Follow the surface round a box into it."""
+    half = box.size * (0.5 + settings.beyond)
+    pixel = float(np.median([abs(c.to_camera(box.center)[2]) / c.fx for c, _ in views]))
+    points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
+    least = pixel * max(settings.least_cell, math.sqrt(settings.least_points / points_per_cell))
+    cell = max(least, float((8 * half.prod() / settings.cells) ** (1 / 3)))
+    dims = tuple(int(n) for n in np.ceil(2 * half / cell))
+    count = min(len(views), settings.views)
+    used = [views[k * len(views) // count] for k in range(count)]
+    found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
+    local = np.concatenate(found)
+    keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T), dims)
+    x = local.T
+    values = [None, *x, *(x[a] * x[b] for a, b in PAIRS)]
+    moments = np.stack([np.bincount(keys, v, math.prod(dims)).reshape(dims) for v in values])
+    there = moments[0] >= settings.least_points
+    points = (moments[1:4, there] / moments[0, there]).T
+    normals = _normals(moments, there)
+    numbers = np.full(dims, -1, np.int32)
+    numbers[there] = np.arange(len(points))
+    edge = (np.abs(points) > half - settings.seeds * box.size).any(1)
+    reached = edge & ~in_region(region, box.center + points @ box.axes.T)
+    turn, steady = math.cos(math.radians(settings.turn)), math.cos(math.radians(settings.steady))
+    limits = np.array([settings.step * cell, turn, steady, settings.adapt, settings.support])
+    planes = np.concatenate([points, normals], axis=1)
+    _grow(numbers, np.argwhere(there), points, normals, limits, reached, planes)
+    nearest = np.full(dims, -1, np.int32)
+    nearest[there] = np.where(reached, np.cumsum(reached) - 1, -1)
+    far, (i, j, k) = scipy.ndimage.distance_transform_edt(nearest < 0, return_indices=True)
+    nearest = np.where(far <= 2, nearest[i, j, k], -1).astype(np.int32)
+    return Surroundings(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
+
+
+def _points_in(box: Box, half: np.ndarray, cell: float, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """The depth map's points in the grid, [N, 3] in the box's axes; of large pictures no more than two per cell."""
+    distance = max(float(camera.to_camera(box.center)[2]), 1e-9)
+    step = max(1, int(0.5 * cell * camera.fx / distance))
+    _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera), step)
+    local = (points - box.center) @ box.axes
+    return local[(np.abs(local) < half).all(1)]
+
+
+def _normals(
+    moments: np.ndarray,  # [10, …] of the grid's cells
+    there: np.ndarray,  # […] bool
+) -> np.ndarray:
+    """The direction in which the points of a cell and its neighbours spread least, [M, 3] (Hoppe 1992)."""
+    total = np.stack([scipy.ndimage.uniform_filter(m, 3, mode="constant")[there] for m in moments])
+    mean = total[1:4] / total[0]
+    covariance = np.empty((total.shape[1], 3, 3))
+    for m, (a, b) in zip(total[4:], PAIRS):
+        covariance[:, a, b] = covariance[:, b, a] = m / total[0] - mean[a] * mean[b]
+    return np.linalg.eigh(covariance)[1][:, :, 0]
+
+
+@exact_kernel
+def _grow(numbers, cells, points, normals, limits, reached, planes):
+    """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated.
+
+    A cell hands on the plane that it was reached by, hardly bent by its own normal: at the foot of an object cells
+    hold both surfaces, and their normals would lead growth up its side.
+    """
+    step, turn, steady, adapt, support = limits[0], limits[1], limits[2], limits[3], limits[4]
+    touched = np.zeros(len(cells), np.bool_)
+    front = np.flatnonzero(reached)
+    while len(front):
+        for row in front:
+            for dx in range(-1, 2):
+                for dy in range(-1, 2):
+                    for dz in range(-1, 2):
+                        other = _number(numbers, cells[row, 0] + dx, cells[row, 1] + dy, cells[row, 2] + dz)
+                        if other >= 0 and not reached[other]:
+                            touched[other] = True
+        waiting = np.flatnonzero(touched)
+        touched[:] = False
+        accepted = np.zeros(len(waiting), np.bool_)
+        for w in range(len(waiting)):
+            row = waiting[w]
+            count, px, py, pz, nx, ny, nz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for dx in range(-2, 3):
+                for dy in range(-2, 3):
+                    for dz in range(-2, 3):
+                        other = _number(numbers, cells[row, 0] + dx, cells[row, 1] + dy, cells[row, 2] + dz)
+                        if other < 0 or not reached[other]:
+                            continue
+                        p, n = planes[other, :3], planes[other, 3:]
+                        sign = -1.0 if nx * n[0] + ny * n[1] + nz * n[2] < 0 else 1.0
+                        count += 1
+                        px, py, pz = px + p[0], py + p[1], pz + p[2]
+                        nx, ny, nz = nx + sign * n[0], ny + sign * n[1], nz + sign * n[2]
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if count < support or length == 0:
+                continue
+            nx, ny, nz = nx / length, ny / length, nz / length
+            px, py, pz = px / count, py / count, pz / count
+            p, n = points[row], normals[row]
+            off = nx * (p[0] - px) + ny * (p[1] - py) + nz * (p[2] - pz)
+            agreement = nx * n[0] + ny * n[1] + nz * n[2]
+            if abs(off) < step and abs(agreement) > turn:
+                accepted[w] = True
+                gain = math.copysign(adapt, agreement) if abs(agreement) > steady else 0.0
+                nx, ny, nz = nx + gain * n[0], ny + gain * n[1], nz + gain * n[2]
+                length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                planes[row, 3], planes[row, 4], planes[row, 5] = nx / length, ny / length, nz / length
+        front = waiting[accepted]
+        reached[front] = True
+
+
+@exact_kernel
+def _number(numbers, i, j, k):
+    if 0 <= i < numbers.shape[0] and 0 <= j < numbers.shape[1] and 0 <= k < numbers.shape[2]:
+        return numbers[i, j, k]
+    return -1

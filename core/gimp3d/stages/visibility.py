@@ -1,0 +1,110 @@
+"""What the views together have seen of the scene: each point of space is judged once, whichever view asks.
+
+That makes target regions consistent between views by construction (METHOD section 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..camera import Camera
+from ..jit import exact_kernel
+from ..threads import parallel_map, run_ranges
+from .outline import Window, surface_points
+
+HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How far every pixel of every view sees past the object."""
+
+    cameras: np.ndarray  # [V, 18] float64: rotation, translation, fx, fy, cx, cy, width, height
+    starts: np.ndarray  # [V] int64, a view's first pixel
+    limits: np.ndarray  # float32, z of the first surface of every pixel; HIDDEN where there is none
+
+    @classmethod
+    def make(
+        cls,
+        views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, untrusted pixels)
+    ) -> Sight:
+        """From depth maps [H, W], 0 = nothing, and masks [H, W] bool of the object and of what else hides the scene."""
+        order = [views[k] for k in _spread_order(len(views))]
+        packed = [np.concatenate([c.R.ravel(), c.t, [c.fx, c.fy, c.cx, c.cy, c.width, c.height]]) for c, _, _ in order]
+        limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
+        sizes = np.array([len(part) for part in limits], np.int64)
+        return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
+
+    def shows(
+        self,
+        points: np.ndarray,  # [N, 3] scene coordinates
+        tolerance: float,  # relative z
+    ) -> np.ndarray:
+        """[N] bool: the point is the first surface of some view, which is not hidden there."""
+        found = np.zeros(len(points), bool)
+        arrays = np.ascontiguousarray(points, np.float64), self.cameras, self.starts, self.limits
+        run_ranges(_find_view, len(points), *arrays, float(tolerance), found)
+        return found
+
+
+def depth_agreement(
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
+    windows: Sequence[Window],  # the parts to look at
+    tolerance: float,  # relative z
+    samples: int = 1000,  # per view
+) -> float:
+    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.
+
+    1 where nothing can be compared.
+    """
+    centres = np.array([c.centre for c in cameras])
+    forwards = np.array([c.forward for c in cameras])
+    spread = max(1e-12, float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1))))
+
+    def compared(k: int) -> np.ndarray:
+        apart = np.linalg.norm(centres - centres[k], axis=1) / spread + 1 - forwards @ forwards[k]
+        apart[k] = np.inf
+        other = int(apart.argmin())
+        _, _, points = surface_points(cameras[k], depths[k], windows[k])
+        uv, z = cameras[other].project(points[:: max(1, len(points) // samples)])
+        height, width = depths[other].shape
+        framed = (z > 0) & (uv >= 0).all(1) & (uv < [width, height]).all(1)
+        cols, rows = uv[framed].astype(int).T
+        there, z = depths[other][rows, cols], z[framed]
+        coarse = max(tolerance, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
+        through = (there > z * (1 + coarse)) | (there == 0)
+        return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
+
+    if len(cameras) < 2:
+        return 1.0
+    same, through = np.sum(parallel_map(compared, range(len(cameras))), axis=0)
+    return float(same / (same + through)) if same + through else 1.0
+
+
+def _spread_order(count: int) -> list[int]:
+    """0 … count−1 so that any first few are spread evenly: neighbouring views see the same."""
+    return sorted(range(count), key=lambda k: (k * 0.6180339887498949) % 1.0)
+
+
+@exact_kernel
+def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
+    """found[i] for i in [lo, hi): views are asked in turn until one sees the point."""
+    for i in range(lo, hi):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for v in range(len(cameras)):
+            c = cameras[v]
+            depth = c[6] * x + c[7] * y + c[8] * z + c[11]
+            if not depth > 0:
+                continue
+            col = c[12] * (c[0] * x + c[1] * y + c[2] * z + c[9]) / depth + c[14]
+            row = c[13] * (c[3] * x + c[4] * y + c[5] * z + c[10]) / depth + c[15]
+            if not (0 <= col < c[16] and 0 <= row < c[17]):
+                continue
+            limit = limits[starts[v] + int(row) * int(c[16]) + int(col)]
+            if abs(depth - limit) <= tolerance * depth:
+                found[i] = True
+                break

@@ -1,0 +1,213 @@
+"""Depth priors: files, small networks made here, and what their numbers mean."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from gimp3d.errors import BadInput
+from gimp3d.priors.monodepth import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    DepthPrior,
+    declared_size,
+    depth_prior,
+    relative_disparity,
+)
+
+
+def test_the_scene_alone_decides_without_a_file():
+    assert all(depth_prior(spec, 4, 5) is None for spec in ("auto", "harmonic", "planar"))
+
+
+# Files
+
+
+@pytest.mark.parametrize("kind", ["", "disparity", "depth", "metric"])
+def test_a_file_is_read_as_what_it_is_said_to_hold(tmp_path, kind):
+    values = np.linspace(1, 2, 48, dtype=np.float32).reshape(6, 8)
+    path = tmp_path / "a, b.npy"
+    np.save(path, values)
+    found = depth_prior(f"file:{path}{',' if kind else ''}{kind}", 6, 8)
+    assert found.kind == (kind or "disparity")
+    np.testing.assert_array_equal(found.values, values)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_png_priors_keep_their_depth(tmp_path, dtype):
+    values = (np.arange(48).reshape(6, 8) * (np.iinfo(dtype).max // 48)).astype(dtype)
+    cv2.imwrite(str(tmp_path / "p.png"), values)
+    np.testing.assert_array_equal(depth_prior(f"file:{tmp_path}/p.png", 6, 8).values, values)
+
+
+def test_a_prior_of_another_size_is_resized(tmp_path):
+    np.save(tmp_path / "p.npy", np.tile(np.arange(32.0), (24, 1)))
+    found = depth_prior(f"file:{tmp_path}/p.npy", 48, 64).values
+    assert found.shape == (48, 64)
+    np.testing.assert_allclose(np.diff(found[10, 2:-2]), 0.5, atol=1e-6)
+
+
+def test_unusable_priors_are_refused(tmp_path):
+    np.save(tmp_path / "colour.npy", np.ones((6, 8, 3)))
+    np.save(tmp_path / "text.npy", np.array([["a", "b"]]))
+    np.save(tmp_path / "portrait.npy", np.ones((8, 6)))
+    np.save(tmp_path / "empty.npy", np.full((6, 8), np.nan))
+    np.save(tmp_path / "object.npy", np.array([[None]]), allow_pickle=True)
+    (tmp_path / "broken.npy").write_bytes(b"nothing")
+    (tmp_path / "broken.png").write_bytes(b"nothing")
+    (tmp_path / "zero.png").write_bytes(b"")
+    for name in ("colour.npy", "text.npy", "portrait.npy", "empty.npy", "object.npy", "broken.npy", "broken.png",
+                 "zero.png", "missing.npy", "missing.exr", ""):  # fmt: skip
+        with pytest.raises(BadInput, match="--depth-prior"):
+            depth_prior(f"file:{tmp_path}/{name}", 6, 8)
+    with pytest.raises(BadInput, match="unknown provider 'depht'"):
+        depth_prior("depht", 6, 8)
+
+
+# What the numbers mean
+
+Z = 2 + np.add.outer(np.linspace(0, 3, 40), np.sin(np.linspace(0, 6, 60)))
+KNOWN = np.ones(Z.shape, bool)
+KNOWN[10:25, 20:40] = False
+
+
+def agreement(found, disparity):
+    """Correlation with the true disparity, 1 for any positive scale and shift."""
+    return np.corrcoef(found.ravel(), disparity.ravel())[0, 1]
+
+
+def test_disparity_and_metric_depth_need_no_fit():
+    np.testing.assert_array_equal(relative_disparity(DepthPrior(Z.astype(np.float32)), 1 / Z, KNOWN), np.float32(Z))
+    values = np.array([[0, 2, np.nan], [-1, 4, np.inf]], np.float32)
+    found = relative_disparity(DepthPrior(values, "metric"), np.ones((2, 3)), np.ones((2, 3), bool))
+    np.testing.assert_array_equal(found, [[np.nan, 0.5, np.nan], [np.nan, 0.25, 0]])
+
+
+@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (0.2, -3.0), (40.0, 500.0)])
+def test_affine_depth_is_fitted_in_depth(scale, shift):
+    """Inverting it as it is would bend planes; fitted first, it is the scene's own disparity."""
+    prior = DepthPrior((scale * Z + shift).astype(np.float32), "depth")
+    rng = np.random.default_rng(0)
+    scene = 1 / Z * (1 + 0.01 * rng.standard_normal(Z.shape))
+    scene[rng.random(Z.shape) < 0.1] *= 3  # outliers
+    np.testing.assert_allclose(relative_disparity(prior, scene, KNOWN), 1 / Z, rtol=0.01)
+
+
+def test_depth_that_runs_the_other_way_disagrees_with_the_scene():
+    prior = DepthPrior((10 - Z).astype(np.float32), "depth")
+    assert agreement(relative_disparity(prior, 1 / Z, KNOWN), 1 / Z) < -0.8
+
+
+def test_constant_depth_and_nothing_known_give_no_fit():
+    flat = DepthPrior(np.ones(Z.shape, np.float32), "depth")
+    assert np.ptp(relative_disparity(flat, 1 / Z, KNOWN)) == 0
+    nothing = relative_disparity(DepthPrior(Z.astype(np.float32), "depth"), 1 / Z, np.zeros(Z.shape, bool))
+    assert agreement(nothing, 1 / Z) > 0
+
+
+def test_what_the_fit_sends_behind_the_camera_has_no_value():
+    values = Z.astype(np.float32)
+    values[15, 30] = -50.0
+    found = relative_disparity(DepthPrior(values, "depth"), 1 / Z, KNOWN)
+    assert np.isnan(found[15, 30]) and np.isfinite(found[KNOWN]).all()
+
+
+# Networks: ONNX files written field by field (protocol buffers), since the package `onnx` is no dependency
+
+
+def varint(value):
+    return bytes([value & 127 | 128 * (value > 127)]) + (varint(value >> 7) if value > 127 else b"")
+
+
+def field(number, value):
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    data = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | 2) + varint(len(data)) + data
+
+
+def value_info(name, shape):
+    dims = b"".join(field(1, field(1, n) if isinstance(n, int) else field(2, n)) for n in shape)
+    return field(1, name) + field(2, field(1, field(1, 1) + field(2, dims)))
+
+
+def network(height="h", width="w", weights=(0.2, 0.3, 0.5), operator="Conv", output=("h", "w")):
+    """A 1×1 convolution: one channel, a weighted sum of the normalised picture's."""
+    tensor = b"".join(field(1, n) for n in (1, 3, 1, 1)) + field(2, 1) + field(8, "k")
+    tensor += field(9, struct.pack("<3f", *weights))
+    kernel = field(1, "kernel_shape") + field(20, 7) + field(8, 1) + field(8, 1)
+    node = field(1, "x") + field(1, "k") + field(2, "y") + field(4, operator) + field(5, kernel)
+    graph = field(1, node) + field(2, "g") + field(5, tensor)
+    graph += field(11, value_info("k", (1, 3, 1, 1))) + field(11, value_info("x", (1, 3, height, width)))
+    graph += field(12, value_info("y", (1, 1, *output)))
+    return field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13))
+
+
+def picture(height, width):
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    waves = [127 + 100 * np.sin(x / 17 + k) * np.cos(y / 13 - k) for k in range(3)]
+    return np.stack(waves, -1).astype(np.uint8)
+
+
+def answer(image, weights=(0.2, 0.3, 0.5)):
+    return ((image / 255 - IMAGENET_MEAN) / IMAGENET_STD) @ np.array(weights)
+
+
+@pytest.mark.parametrize("height, width, given, size", [(48, 64, "", (64, 48)), ("h", "w", ",80x60", (80, 60)),
+                                                        ("h", "w", "", (518, 518))])  # fmt: skip
+@pytest.mark.parametrize("kind", ["", ",depth"])
+def test_a_model_sees_the_normalised_picture_in_its_own_size(tmp_path, height, width, given, size, kind):
+    path = tmp_path / "model.onnx"
+    path.write_bytes(network(height, width))
+    image = picture(90, 120)
+    found = depth_prior(f"onnx:{path}{kind}{given}", 90, 120, image)
+    assert found.kind == (kind[1:] or "disparity") and found.values.shape == (90, 120)
+    wanted = answer(image)
+    assert np.abs(found.values - wanted)[3:-3, 3:-3].mean() < 0.02 * np.ptp(wanted)
+    assert declared_size(path.read_bytes()) == (None if height == "h" else size)
+
+
+def test_a_model_that_predicts_disparity_guides_the_completion(tmp_path):
+    """From the file to the depth: a network that has learned this scene, up to scale and shift."""
+    from gimp3d.stages.depth import complete_disparity
+
+    path = tmp_path / "model.onnx"
+    path.write_bytes(network(120, 160, (0.0, 1.0, 0.0)))
+    v, u = np.mgrid[:120, :160]
+    truth = 0.3 + 0.1 * np.exp(-((u - 86) ** 2 + (v - 66) ** 2) / 300) + 0.05 * np.sin(u / 15)
+    image = np.repeat(((truth - 0.2) / 0.3 * 255).round().astype(np.uint8)[..., None], 3, -1)
+    hole = np.hypot(v - 60, u - 80) < 28
+    prior = relative_disparity(depth_prior(f"onnx:{path}", 120, 160, image), truth, ~hole)
+    found = complete_disparity(np.where(hole, 9, truth), ~hole, hole, prior)
+    assert found.reason.startswith("guided")
+    assert np.percentile(np.abs(found.depth * truth - 1)[hole], 95) < 0.01
+
+
+def test_unusable_models_are_refused_in_one_line(tmp_path, capfd):
+    image, path = picture(30, 40), tmp_path / "m.onnx"
+    cases = {
+        "cannot read": None,
+        "not an ONNX model": b"nothing at all, only words",
+        "OpenCV cannot run": network(48, 64, operator="NoSuchThing"),
+        "which is no depth picture": network(1, 64),
+    }
+    for words, data in cases.items():
+        path.unlink(missing_ok=True)
+        if data is not None:
+            path.write_bytes(data)
+        with pytest.raises(BadInput, match="--depth-prior onnx") as error:
+            depth_prior(f"onnx:{path}", 30, 40, image)
+        assert words in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(BadInput, match="no picture to look at"):
+        depth_prior(f"onnx:{path}", 30, 40)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("cut", range(1, 60, 7))
+def test_models_cut_short_are_refused(tmp_path, cut):
+    (tmp_path / "m.onnx").write_bytes(network(48, 64)[:-cut])
+    with pytest.raises(BadInput):
+        depth_prior(f"onnx:{tmp_path}/m.onnx", 30, 40, picture(30, 40))

@@ -1,0 +1,111 @@
+"""Boxes, windows and parts of views."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import cameras, scene
+
+from gimp3d.box import Box
+from gimp3d.camera import Camera
+from gimp3d.orbit import look_at
+from gimp3d.raster import footprint, render, surface_depth
+from gimp3d.stages.outline import (
+    box_polygon,
+    box_window,
+    cropped,
+    fill_polygon,
+    gaussians_window,
+    surface_points,
+    window_round,
+)
+
+
+def some_camera(rng: np.random.Generator, eye: np.ndarray) -> Camera:
+    return Camera("c", 40, 30, 30, 30, 20, 15, look_at(eye, rng.normal(size=3), np.array([0, 0, 1.0])))
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_polygon_holds_what_rays_through_the_box_hit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    box = Box.make(rng.normal(size=3), rng.uniform(0.2, 2, 3), rng.normal(size=4))
+    eye = rng.normal(size=3) * 3
+    if box.contains(eye[None])[0]:
+        return
+    camera = some_camera(rng, eye)
+    polygon = box_polygon(box, camera, 1e-4)
+    mask = np.zeros((30, 40), bool) if polygon is None else fill_polygon(polygon, 40, 30)
+    # brute force: slab test of every pixel centre's ray
+    rays = camera.unproject(camera.pixel_centres(), np.ones((30, 40))) - camera.centre
+    origin, direction = (eye - box.center) @ box.axes, rays @ box.axes
+    with np.errstate(divide="ignore"):
+        a, b = (-box.size / 2 - origin) / direction, (box.size / 2 - origin) / direction
+    near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+    hit = (near <= far) & (far > 0)
+    clear = np.abs(far - near) > 0.02 * np.linalg.norm(box.size)
+    assert (mask == hit)[clear].mean() > 0.995
+    rows, cols = box_window(box, camera)
+    outside = mask.copy()
+    outside[rows, cols] = False
+    assert not outside.any()
+
+
+def test_a_box_partly_behind_the_camera_is_clipped_not_mirrored() -> None:
+    camera = Camera("c", 100, 100, 50, 50, 50, 50, np.eye(4))
+    box = Box.make([0, 1.0, 0], [0.5, 0.5, 6])  # a beam below the camera, from behind to in front
+    mask = fill_polygon(box_polygon(box, camera, 1e-3), 100, 100)
+    assert mask[60:, 40:60].any() and not mask[:50].any()
+    assert box_window(box, camera) == (slice(0, 100), slice(0, 100))
+    assert box_polygon(Box.make([0, 0, -3], [1, 1, 1]), camera, 1e-3) is None
+
+
+def test_pixel_centres_decide() -> None:
+    square = np.array([[1.0, 1], [3.5, 1], [3.5, 2.5], [1, 2.5]])
+    expected = np.zeros((4, 5), bool)
+    expected[1:2, 1:3] = True  # centres 1.5 and 2.5 lie inside, 3.5 is on the edge
+    assert (fill_polygon(square, 5, 4)[:2, :3] == expected[:2, :3]).all()
+    assert (fill_polygon(square[::-1], 5, 4) == fill_polygon(square, 5, 4)).all()
+
+
+def test_windows_lie_in_the_picture_and_are_never_empty() -> None:
+    camera = cameras()[0]
+    for points in (np.empty((0, 2)), np.array([[-50.0, -9]]), np.array([[500.0, 400], [700, 800]]), np.zeros((1, 2))):
+        rows, cols = window_round(points, camera, 3)
+        assert 0 <= rows.start < rows.stop <= camera.height and 0 <= cols.start < cols.stop <= camera.width
+    assert window_round(np.array([[10.2, 20.7]]), camera, 2) == (slice(18, 23), slice(8, 13))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_gaussians_touch_nothing_outside_their_window(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    g, camera = scene(), cameras()[int(rng.integers(9))]
+    chosen = np.zeros(len(g), bool)
+    chosen[rng.integers(0, len(g), 8)] = True
+    weight = footprint(g.take(chosen), camera, np.ones(8, bool))
+    weight[gaussians_window(g.take(chosen), camera, 2)] = 0
+    assert not weight.any()
+
+
+def test_a_part_of_a_view_shows_the_same() -> None:
+    g, camera = scene(), cameras()[4]
+    window = (slice(20, 70), slice(31, 90))
+    whole, part = render(g, camera), render(g, cropped(camera, window))
+    inner = (slice(25, 65), slice(36, 85))  # splats outside a picture are drawn with a clamped slope (Kerbl 2023)
+    assert np.abs(whole.rgb[inner] - part.rgb[5:45, 5:54]).max() < 0.02
+    rows, cols, points = surface_points(camera, surface_depth(g, camera)[0], window, 3)
+    uv, z = camera.project(points)
+    assert np.abs(uv - np.stack([cols + 0.5, rows + 0.5], -1)).max() < 1e-6 and (z > 0).all()
+    assert set(np.unique(rows - 20) % 3) == {0} and set(np.unique(cols - 31) % 3) == {0}
+
+
+def test_windows_of_what_lies_behind_the_camera() -> None:
+    camera = cameras()[0]
+    g = scene().take(np.arange(3))
+    g.means[:] = camera.centre + 0.01 * camera.forward
+    assert gaussians_window(g, camera, 0) == (slice(0, camera.height), slice(0, camera.width))
+    g.means[:] = camera.centre - 5 * camera.forward
+    rows, cols = gaussians_window(g, camera, 0)
+    assert (rows.stop - rows.start) * (cols.stop - cols.start) <= 4

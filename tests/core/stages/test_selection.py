@@ -1,0 +1,183 @@
+"""Which Gaussians go: the object, its halo and its smears; not the floor that the box cuts into."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import BLOCK, block, cameras, discs, floor, scene, truth
+from scipy.special import ndtr
+
+from gimp3d.box import Box, Region
+from gimp3d.gaussians import Gaussians
+from gimp3d.pipeline import render_bytes
+from gimp3d.raster import render
+from gimp3d.stages.masks import Masks, MaskSettings, find_masks
+from gimp3d.stages.selection import Fate, SelectionSettings, mass_inside, select_removed
+
+DEEP = (Box.make([0, 0, 0.2], [0.9, 0.9, 0.72]),)  # cuts 16 cm into the floor, a hand's width round the block
+VIEWS = cameras(12, 200, 150)
+FLOOR = len(floor(with_hole=True))
+RED = np.array([0.85, 0.12, 0.1])
+
+
+def balls(points: np.ndarray, colours: np.ndarray, size: float, opacity_logit: float) -> Gaussians:
+    made = discs(np.asarray(points, float), (0, 0, 1), np.asarray(colours, float), size)
+    made.log_scales[:] = np.log(size)
+    made.opacity_logits[:] = opacity_logit
+    return made
+
+
+def found(gaussians: Gaussians, region: Region = DEEP, clean: Gaussians | None = None, **changed: float) -> Masks:
+    """Masks with photos of the clean scene, by default of the scene itself."""
+    photos = {c.id: render_bytes(gaussians if clean is None else clean, c) for c in VIEWS}
+    return find_masks(gaussians, region, VIEWS, MaskSettings(selection=SelectionSettings(**changed)), photos=photos)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_mass_is_the_integral_over_the_box(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    g = discs(rng.normal(size=(20, 3)), (0, 0, 1), np.full((20, 3), 0.5), 1.0)
+    g.log_scales[:] = rng.uniform(-3, 1, (20, 3))
+    turn = rng.normal(size=4)
+    g.quats[:] = turn
+    box = Box.make(
+        rng.normal(size=3), rng.uniform(0.3, 3, 3), turn
+    )  # aligned with them: per axis, by the error function
+    low, high = (((g.means - box.center) @ box.axes * -1 + s * box.size / 2) / g.scales for s in (-1, 1))
+    exact = (ndtr(high) - ndtr(low)).prod(1)
+    assert np.abs(mass_inside(g, np.arange(20), (box,)) - exact).max() < 0.06
+    assert np.abs(mass_inside(g, np.arange(20), (box,), 4096) - exact).max() < 0.012
+
+
+def test_mass_in_overlapping_boxes_counts_once_and_surfels_are_flat() -> None:
+    g = discs(np.zeros((1, 3)), (0, 0, 1), np.full((1, 3), 0.5), 1.0)
+    box = Box.make([0, 0, 0], [2, 2, 2])
+    rows = np.array([0])
+    one = mass_inside(g, rows, (box,))
+    assert mass_inside(g, rows, (box, box)) == one
+    surfel = replace(g, log_scales=np.zeros((1, 2), np.float32))
+    flat = mass_inside(surfel, rows, (Box.make([0, 0, 0], [2, 2, 1e-3]),), 4096)
+    assert abs(flat[0] - (ndtr(1) - ndtr(-1)) ** 2) < 0.01
+    assert mass_inside(g, np.array([], int), (box,)).shape == (0,)
+
+
+def test_floor_in_the_box_stays_and_the_object_goes() -> None:
+    masks = found(scene())
+    fates = masks.selection.fates
+    distance = np.abs(scene().means[:FLOOR, :2]).max(1) - BLOCK / 2
+    inside = select_removed(scene(), DEEP)[:FLOOR]
+    assert (fates[FLOOR:] >= Fate.REMOVED_INSIDE).all()
+    assert inside.sum() > 200 and (fates[:FLOOR][inside & (distance > 0.08)] < Fate.REMOVED_INSIDE).all()
+    assert (fates[:FLOOR][inside] == Fate.KEPT_SURFACE).mean() > 0.5
+    assert masks.removed[:FLOOR].mean() < 0.03 and not masks.removed[:FLOOR][distance > 0.1].any()
+    assert sum(masks.selection.counts.values()) == (fates > 0).sum()
+    assert "of floor or wall" in masks.reason and str(int(masks.removed.sum())) in masks.reason
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.0, 1.2])
+@pytest.mark.parametrize("lower", [0.0, 0.1])
+def test_the_box_may_be_drawn_carelessly(scale: float, lower: float) -> None:
+    box = replace(DEEP[0], size=DEEP[0].size * scale, center=DEEP[0].center - [0, 0, lower])
+    fates = found(scene(), (box,)).selection.fates
+    assert (fates[FLOOR:][select_removed(scene(), (box,))[FLOOR:]] >= Fate.REMOVED_INSIDE).all()
+    assert (fates[:FLOOR] >= Fate.REMOVED_INSIDE).mean() < 0.03
+
+
+def test_parts_of_the_object_outside_a_small_box_keep_nothing_in_it() -> None:
+    small = (Box.make([0, 0, 0.3], [0.4, 0.4, 0.5]),)
+    masks = found(scene(), small)
+    assert masks.selection.count(Fate.KEPT_SURFACE) == 0
+    assert masks.removed[select_removed(scene(), small)].all()
+
+
+def test_straddlers_go_where_they_show_on_the_object_and_stay_elsewhere() -> None:
+    low = (Box.make([0, 0, 0.224], [0.9, 0.9, 0.548]),)  # the block's top, at 0.5, sticks out by 2 mm
+    fates = found(scene(), low).selection.fates
+    top = scene().means[:, 2] > 0.49
+    assert not select_removed(scene(), low)[top].any()
+    assert (fates[top & (np.abs(scene().means[:, :2]) < 0.2).all(1)] == Fate.REMOVED_STRADDLING).all()
+    edge = (np.abs(np.abs(scene().means[:FLOOR, :2]) - 0.45) < 0.02).any(1)  # floor astride the box's side
+    assert Fate.KEPT_STRADDLING in fates[:FLOOR][edge] and (fates[:FLOOR][edge] < Fate.REMOVED_INSIDE).all()
+
+
+def test_a_giant_of_the_background_stays_and_opens_no_hole() -> None:
+    ground = balls([[0.1, 0.05, -0.03]], [[0.4, 0.5, 0.45]], 1.0, 4.0)
+    ground.log_scales[:, 2] = np.log(0.002)
+    rim = floor(with_hole=True)
+    rim = rim.take((np.abs(rim.means[:, :2]) > 1.4).any(1))  # so that the giant is all there is near the block
+    whole = rim.extended(block()).extended(ground)
+    masks = found(whole)
+    assert masks.selection.fates[-1] == Fate.KEPT_LARGE and masks.selection.counts["kept_large"] == 1
+    for view in masks.views[::4]:
+        before = render(whole, view.camera).alpha
+        assert (view.alpha_after[~view.polygon] > before[~view.polygon] - 0.05).all()
+
+
+def test_smears_under_and_behind_the_object_go_and_little_else() -> None:
+    """Splats that no clean photo vouches for, planted into a clean scene: precision and recall."""
+    rng = np.random.default_rng(0)
+    under = rng.uniform([-0.2, -0.2, -0.04], [0.2, 0.2, 0.02], (90, 3))
+    inside = rng.uniform([-0.2, -0.2, 0.05], [0.2, 0.2, 0.45], (90, 3))
+    planted = balls(np.concatenate([under, inside]), np.tile(RED, (180, 1)), 0.02, 1.0)
+    whole = scene().extended(planted)
+    shallow = (Box.make([0, 0, 0.29], [0.9, 0.9, 0.5]),)  # from 4 cm above the floor on: most smears lie outside
+    masks = found(whole, shallow, scene())
+    wrong = np.zeros(len(whole), bool)
+    wrong[FLOOR:] = True  # the block and all that was planted
+    recall = masks.removed[-180:].mean()
+    precision = wrong[masks.removed].mean()
+    assert recall > 0.9, recall
+    assert precision > 0.9, precision
+    assert masks.selection.counts["removed_revealed"] > 0
+    without = found(whole, shallow, scene(), support=0.0)
+    assert without.removed[-180:].mean() < recall
+
+
+def test_haze_behind_the_object_is_told_from_floor_by_the_photos() -> None:
+    """Floaters behind the block, seen past it from the sides, where clean photos do not show them."""
+    rng = np.random.default_rng(1)
+    haze = balls(rng.uniform([-0.08, 0.28, 0.04], [0.08, 0.44, 0.2], (25, 3)), np.tile(RED, (25, 1)), 0.02, 3.0)
+    whole = scene().extended(haze)
+    tight = (Box.make([0, 0, 0.26], [0.56, 0.56, 0.56]),)
+    front = tuple(c for c in VIEWS if c.centre[1] < 0.3)
+    with_photos, without = (
+        find_masks(whole, tight, front, photos={c.id: render_bytes(clean, c) for c in front})
+        for clean in (scene(), whole)
+    )
+    assert with_photos.removed[-25:].sum() > without.removed[-25:].sum()
+    assert with_photos.removed[-25:].mean() > 0.7
+    assert with_photos.removed[:FLOOR].mean() < 0.03
+
+
+def test_where_nothing_stands_on_the_surface_the_surface_itself_goes() -> None:
+    patch = (Box.make([0, 0, 0], [0.5, 0.5, 0.2]),)
+    masks = found(truth(), patch)
+    assert (masks.removed == select_removed(truth(), patch)).all() and masks.removed.any()
+
+
+def test_by_centre_is_the_papers_rule() -> None:
+    masks = found(scene(), by_centre=True)
+    assert (masks.removed == select_removed(scene(), DEEP)).all()
+    assert set(np.unique(masks.selection.fates)) == {Fate.OUTSIDE, Fate.REMOVED_INSIDE}
+
+
+def test_unusable_rows_are_never_removed_and_never_counted() -> None:
+    g = scene()
+    rows = np.flatnonzero(select_removed(g, DEEP))[[0, 300, 900]]
+    g.sh[rows[0], 0, 0] = np.nan
+    g.means[rows[1]] = np.nan
+    g.quats[rows[2]] = 0
+    masks = found(g)
+    assert (masks.selection.fates[rows] == Fate.OUTSIDE).all() and masks.removed.sum() > 1000
+
+
+def test_overlapping_boxes_are_their_union() -> None:
+    halves = (Box.make([-0.1, 0, 0.2], [0.7, 0.9, 0.72]), Box.make([0.1, 0, 0.2], [0.7, 0.9, 0.72]))
+    assert (select_removed(scene(), halves) == select_removed(scene(), DEEP)).all()
+    one, two = found(scene()).removed, found(scene(), halves).removed
+    assert two[FLOOR:].all() and (one != two).mean() < 0.01
