@@ -42,7 +42,7 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
@@ -76,7 +76,7 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
+        seed=SeedSettings(largest=1, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         use_evidence=False,
         extra_references=0,
     ),
@@ -324,7 +324,14 @@ def _fill_from_one_view(
     ]
     new: Gaussians = run(
         f"seed{suffix}",
-        lambda: colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
+        lambda: settle_gaussians(
+            filled,
+            colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
+            view.camera,
+            loaders,
+            painting.views,
+            settings.seed,
+        ),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
