@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,8 @@ from ..errors import BadInput
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import PixelRegion, pixel_region
+from ..threads import parallel_map
+from .propagate import Rule
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
 C1, C2 = 0.01**2, 0.03**2
@@ -23,10 +27,11 @@ class RefineSettings:
     """How the new Gaussians are optimised. Lengths in pixels."""
 
     steps: int = 0  # one view each; 0: the closed form is final
+    views: int = 48  # as many of the painted ones at most: each holds its part of the scene in memory
     ssim: float = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
     margin: int = 4  # of known picture round the target that counts as well: no visible seam
     held_out: int = 8  # every so many views is not learned from; it says when to stop
-    check: int = 50  # steps between two looks at the held-out views
+    check: int = 25  # steps between two looks at the held-out views
     patience: int = 2  # looks without an improvement before it stops
     # Learning rates of Adam; that of means is in units of the Gaussians' median size, per step
     rate_means: float = 0.02
@@ -47,6 +52,28 @@ class Observation:
     image: np.ndarray  # [H, W, 3] uint8
     target: np.ndarray  # [H, W] bool, what was painted
     weight: np.ndarray  # [H, W] float32 ≥ 0, how far each pixel is trusted
+
+
+# How far a painted pixel is believed, by the rule that gave its colour.
+TRUST = {
+    Rule.EVIDENCE: 1.0,
+    Rule.OWN_PIXELS: 0.5,
+    Rule.RETARGETED: 0.5,
+    Rule.OTHER_VIEW: 0.25,
+    Rule.REFERENCE: 0.25,
+}
+
+
+def observed(
+    camera: Camera,
+    image: np.ndarray,  # [H, W, 3] uint8, the painted view
+    rules: np.ndarray,  # [H, W] uint8, see Rule
+) -> Observation:
+    """What a painted view tells: its hole, each pixel as far as its rule is believed."""
+    weights = np.zeros(max(Rule) + 1, np.float32)
+    for rule, weight in TRUST.items():
+        weights[rule] = weight
+    return Observation(camera, image, rules != Rule.UNTOUCHED, weights[rules])
 
 
 @dataclass(frozen=True)
@@ -87,7 +114,8 @@ def refine_gaussians(
     BadInput
         If torch is missing.
     """
-    seen = [o for o in observations if o.target.any() and (o.weight[o.target] > 0).any()]
+    seen = [o for o in observations if (o.weight[o.target] > 0).any()]
+    seen = seen[:: math.ceil(len(seen) / settings.views) or 1]
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
     if not torch_is_there():
@@ -112,7 +140,7 @@ def _refine(
 ) -> Refinement:
     import torch
 
-    views = [_View(frozen, o, settings) for o in seen]
+    views = parallel_map(lambda o: _View(frozen, o, settings), seen)
     judges = views[settings.held_out // 2 :: settings.held_out] or views[:1]
     learners = [v for v in views if v not in judges] or views
     state = _State(new, settings)
@@ -123,7 +151,8 @@ def _refine(
             return float(np.mean([v.loss(state).item() for v in judges]))
 
     before = best = judged()
-    kept, kept_step, waited, order = state.gaussians(), 0, 0, []
+    kept, kept_step, waited = state.gaussians(), 0, 0
+    order: list[int] = []
     for step in range(1, settings.steps + 1):
         if not order:
             order = list(rng.permutation(len(learners)))
@@ -209,7 +238,9 @@ class _View:
         self.weight = torch.from_numpy(weight[self.window].astype(np.float32))
         self.counted = torch.from_numpy(counted[self.window])
 
-    def loss(self, state: _State):  # type: ignore[no-untyped-def]  # torch.Tensor, which is not imported here
+        self.rays = torch.from_numpy(_rays(observation.camera)[self.window].astype(np.float32))
+
+    def loss(self, state: _State) -> Any:  # torch.Tensor, which is not imported here
         import torch
 
         from ..raster.autograd import rasterize
@@ -217,18 +248,40 @@ class _View:
         means, log_scales, quats, opacity_logits, dc, rest = state.parameters
         sh = torch.cat([dc, rest], 1)
         drawn = rasterize(means, log_scales, quats, opacity_logits, sh, self.region, antialiased=self.antialiased)
-        rgb = torch.where(self.counted[..., None], drawn.rgb[self.window].clamp(0, 1), self.image)
         total = self.weight.sum()
-        absolute = ((rgb - self.image).abs().mean(-1) * self.weight).sum() / total
-        structure = ((1 - _ssim(rgb, self.image)).mean(-1) * self.weight).sum() / total
+
+        def mean(values: Any) -> Any:
+            return (values * self.weight).sum() / total
+
+        def part(picture: Any) -> Any:
+            return picture[self.window]
+
+        rgb = torch.where(self.counted[..., None], part(drawn.rgb).clamp(0, 1), self.image)
+        absolute, structure = mean((rgb - self.image).abs().mean(-1)), mean((1 - _ssim(rgb, self.image)).mean(-1))
         loss = (1 - self.settings.ssim) * absolute + self.settings.ssim * structure
         if self.surfels:
-            distortion = (drawn.distortion[self.window] * self.weight).sum() / total
-            loss = loss + self.settings.distortion * distortion
+            across = (part(drawn.normals) * _normals(part(drawn.expected_depth), self.rays)).sum(-1)
+            loss = loss + self.settings.distortion * mean(part(drawn.distortion))
+            loss = loss + self.settings.normal * mean(1 - across)
         return loss
 
 
-def _ssim(a, b):  # type: ignore[no-untyped-def]  # torch.Tensor [H, W, 3] each
+def _rays(camera: Camera) -> np.ndarray:
+    """Points at depth 1 that the pixels show, [H, W, 3] in camera axes."""
+    flat = (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
+
+
+def _normals(depth: Any, rays: Any) -> Any:  # torch.Tensor [H, W], [H, W, 3]
+    """Unit normals [H, W, 3] of a depth map, facing the camera (Huang 2024, eq. 16)."""
+    import torch
+
+    points = rays * depth[..., None]
+    right, down = (torch.gradient(points, dim=d)[0] for d in (1, 0))
+    return torch.nn.functional.normalize(torch.cross(down, right, dim=-1), dim=-1)
+
+
+def _ssim(a: Any, b: Any) -> Any:  # torch.Tensor [H, W, 3] each
     """The SSIM map [H, W, 3] with a Gaussian window (Wang 2004)."""
     import torch
 

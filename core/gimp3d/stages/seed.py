@@ -11,7 +11,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
+from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
 from ..raster import PictureGradients, RasterSettings, contributions, pixel_region
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
@@ -34,6 +34,7 @@ class SeedSettings:
     maximum_slant: float = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
     thickness: float = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
     opacity: float = 0.98
+    sink: float = 0.25  # depth under the surface, in standard deviations; see settle_gaussians
     needed: float = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
     corrections: int = 1  # steps by which c_0 is corrected so that the scene, drawn, shows the painted views
     hold: float = 3.0  # px of blend weight by which c_0 is held at the reference's colour
@@ -242,10 +243,14 @@ def settle_gaussians(
     linear in the colours c_0, pixels = W c_0 + known; one gradient step of least squares, scaled by W's column sums
     (SIRT), takes most of what is missing. It is taken over views all round: a step for the reference alone would undo,
     there, how near splats cover far ones, and double that on the other side.
+
+    That covering moves the texture away from whoever looks, by part of a splat. Splats a little under the surface move
+    it back, from all sides: parallax draws what is deeper nearer to the viewer's foot.
     """
     others = [(view, paint) for view, paint in zip(views, painted) if paint.camera_id != reference.id]
     stride = max(1, math.ceil(len(others) / max(1, settings.looks)))
     looks = [(load(), paint) for load, paint in others[::stride]]
+    new = _sunk(new, reference, settings.sink)
     joined = scene.extended(new)
     cameras = [reference, *(view.camera for view, _ in looks)]
     peaks = parallel_map(lambda c: contributions(joined, c).peak[len(scene) :], cameras)
@@ -257,6 +262,18 @@ def settle_gaussians(
         sh[:, 0] += missing / (weights + settings.hold)
         new = replace(new, sh=sh)
     return new
+
+
+def _sunk(
+    gaussians: Gaussians,
+    reference: Camera,
+    depth: float,  # in standard deviations along the longest axis
+) -> Gaussians:
+    """Flat Gaussians moved along their normal, away from the reference."""
+    means = gaussians.means.astype(np.float64)
+    normals = quats_to_matrices(gaussians.quats.astype(np.float64))[:, :, 2]
+    normals *= np.sign((normals * (means - reference.centre)).sum(-1, keepdims=True))
+    return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
 
 
 def _colour_step(
