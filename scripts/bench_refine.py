@@ -45,7 +45,8 @@ def refined(steps: int, **changed: Any) -> RemovalSettings:
 
 
 COLOURS_ALONE = {f"rate_{name}": 0.0 for name in ("means", "scales", "quats", "opacity", "view_dependence")}
-PRESET_METHODS = {name: PRESETS[name] for name in ("paper-literal", "paper", "draft", "balanced", "best")}
+PAPER = {name: PRESETS[name] for name in ("paper-literal", "paper")}
+OURS = {name: PRESETS[name] for name in ("draft", "balanced", "best")}
 ABLATIONS = {
     "not refined": seeded(),
     "… one per pixel, as seeded": replace(seeded(), seed=EVERY_PIXEL),
@@ -60,7 +61,7 @@ COUNTS = {
 }
 DEGREES = {f"degree {degree}": seeded(sh_degree=degree) for degree in range(4)}
 STEPS = {f"{steps} steps": refined(steps) for steps in (25, 200)}
-GROUPS = {"presets": PRESET_METHODS, "ablations": ABLATIONS, "counts": COUNTS, "degrees": DEGREES, "steps": STEPS}
+GROUPS = {"paper": PAPER, "presets": OURS, "ablations": ABLATIONS, "counts": COUNTS, "degrees": DEGREES, "steps": STEPS}
 # Settings of these make a stage's result; what comes before them is the same for all of ours.
 OWN_STAGES = ("seed", "refine")
 
@@ -184,13 +185,14 @@ def run(
         scene, ours = load_scene(data / name), SharedStages()
         for group, methods in groups.items():
             for method, settings in methods.items():
-                shared = SharedStages() if method.startswith("paper") else ours
+                shared = SharedStages() if group == "paper" else ours
                 rows.append(measure(scene, method, settings, shared) | {"group": group})
                 row = rows[-1]
                 print(
                     f"{name:8}{method:28}{row['psnr mask']:7.2f}{row['psnr unseen']:7.2f}{row['added']:6}", flush=True
                 )
-        rows += baselines(scene, ours.kept["masks"][0].removed)
+        if "masks" in ours.kept:
+            rows += baselines(scene, ours.kept["masks"][0].removed)
         (out / "refine.json").write_text(json.dumps(rows, indent=1))
     return rows
 
@@ -205,13 +207,20 @@ def main() -> None:
     parser.add_argument(
         "--assets", type=Path, help="where charts go; default: assets of a full run, else beside the tables"
     )
+    parser.add_argument("--paper-steps", type=int, default=PRESETS["paper"].refine.steps, help="fewer: a shorter run")
+    parser.add_argument("--add", type=Path, help="a refine.json of other groups, to be reported along")
     given = parser.parse_args()
     scenes, groups = tuple(given.scenes.split(",")), {g: GROUPS[g] for g in given.groups.split(",")}
+    if "paper" in groups:
+        shorter = replace(PRESETS["paper"].refine, steps=given.paper_steps)
+        groups["paper"] = {name: replace(settings, refine=shorter) for name, settings in PAPER.items()}
     if given.quick:
-        scenes, groups = scenes[:1], {"presets": {n: PRESETS[n] for n in ("draft", "balanced")}}
+        scenes, groups = scenes[:1], {"presets": {n: OURS[n] for n in ("draft", "balanced")}}
     given.out.mkdir(parents=True, exist_ok=True)
     rows = run(given.data, scenes, groups, given.out)
-    full = scenes == SCENES and list(groups) == list(GROUPS)
+    if given.add:
+        rows = [*json.loads(given.add.read_text()), *rows]
+    full = scenes == SCENES and {r["group"] for r in rows} > set(GROUPS)
     write_report(rows, given.out, given.assets or (Path("assets") if full else given.out))
 
 

@@ -60,14 +60,14 @@ def tables(rows: Sequence[Row]) -> str:
     parts += ["## CPU seconds per stage, means", "", "| method | " + " | ".join(STAGES) + " |"]
     parts.append("|---|" + "---:|" * len(STAGES))
     for row in average:
-        if row["group"] == "presets":
+        if row["group"] in ("paper", "presets"):
             parts.append(f"| {row['method']} | " + " | ".join(f"{row['stages'][s]:.2f}" for s in STAGES) + " |")
     return "\n".join(parts) + "\n"
 
 
 def pareto(rows: Sequence[Row]) -> str:
     """Quality against CPU seconds: one bubble per preset, ablation and baseline; its area is the Gaussians added."""
-    chosen = [r for r in rows if r["group"] in ("presets", "ablations", "baselines")]
+    chosen = [r for r in rows if r["group"] in HUES]
     scenes = list(dict.fromkeys(r["scene"] for r in chosen))
     wide, high = 470, 330
     columns = 2
@@ -92,7 +92,7 @@ def _bubbles(scene: str, rows: Sequence[Row], left: float, top: float, wide: flo
     parts = frame(scene, x, y, ticks, {v: str(v) for v in range(low, top_value + 1, step)}, "CPU seconds", "dB")
     lowest = math.inf
     for row in sorted(rows, key=lambda r: r["psnr unseen"]):
-        hue = HUES["paper" if row["method"].startswith("paper") else row["group"]]
+        hue = HUES[row["group"]]
         px, py = x.place(max(row["seconds"], 1.0)), y.place(row["psnr unseen"])
         radius = max(2.5, 0.14 * math.sqrt(row["added"]))
         parts.append(

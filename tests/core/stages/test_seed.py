@@ -252,7 +252,9 @@ def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
     load = [partial(lambda v: v, v) for v in views]
     new = settle_gaussians(truth(), below, view.camera, load, painted, SeedSettings(corrections=0))
     assert len(new) < 0.1 * len(below)  # the floor hides them
-    everything = settle_gaussians(truth(), below, view.camera, load, painted, SeedSettings(needed=0, corrections=0))
+    everything = settle_gaussians(
+        truth(), below, view.camera, load, painted, SeedSettings(needed=0, corrections=0, sink=0)
+    )
     assert np.array_equal(everything.means, below.means)
 
 
