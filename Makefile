@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-pareto bench-large extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -32,7 +32,8 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-pareto
+bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
+	bench-pareto
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -62,6 +63,21 @@ bench-pareto: $(READY)
 # desk with every Gaussian split in ten and 200 views of 960 × 540
 bench-large: $(READY)
 	$(BIN)/python scripts/bench_large.py $(DATA)/desk
+
+# scikit-image's photographs and other programs' fills come from an environment of their own
+OTHERS := build/others
+
+$(OTHERS)/.ready:
+	$(PYTHON) -m venv $(OTHERS)
+	$(OTHERS)/bin/python -m pip install --quiet 'numpy<2' scikit-image==0.26.0 imageio
+	$(OTHERS)/bin/python -m pip install --quiet PyPatchMatch==2.2.0 || echo "PyPatchMatch cannot be installed here; it is left out"
+	@touch $@
+
+bench-nnf: $(READY) $(OTHERS)/.ready
+	$(BIN)/python scripts/bench_nnf.py --others $(OTHERS)/bin/python
+
+bench-inpaint: $(READY) $(OTHERS)/.ready
+	$(BIN)/python scripts/bench_inpaint.py --others $(OTHERS)/bin/python
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

@@ -60,7 +60,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     inpaint: StringProperty(
         name="Fill",
         default="exemplar",
-        description="What invents the never-seen part: exemplar, telea, ns, shiftmap, file:PATH or command:CMD",
+        description="What invents the never-seen part: exemplar, telea, ns, shiftmap, fsr, file:, onnx: or command:",
     )
     depth_prior: StringProperty(
         name="Surface",

@@ -399,6 +399,12 @@ def _job_key(job: RemovalJob, views: Sequence[View], extra: Mapping[str, np.ndar
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
             digest.update(Path(path).read_bytes())
+    for provider in (job.inpaint, job.depth_prior):
+        path = provider.partition(":")[2]
+        while path and not Path(path).is_file():  # options follow a file's name after commas
+            path = path.rpartition(",")[0]
+        if path:
+            digest.update(Path(path).read_bytes())
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
         digest.update(view.image.tobytes())

@@ -77,6 +77,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(
             largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
@@ -338,6 +339,8 @@ def _fill_from_one_view(
             ),
             settings.mapping,
             settings.random_seed,
+            view.camera,
+            depth,
         ),
     )
     reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
@@ -452,7 +455,8 @@ def _appearance(
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
-    filled = inpaint_reference(settings.inpaint, base, view.target & ~seen, settings.random_seed)
+    hole = view.target & ~seen
+    filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
