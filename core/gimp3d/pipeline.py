@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from .box import Region
@@ -20,6 +21,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.exposure import level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -65,13 +67,13 @@ class RemovalSettings:
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
     use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
-    extra_references: int = 2  # views completed after the first one, where it does not reach
-    extra_gain: float = 0.02  # share of the hole that an extra reference must still find open
+    extra_references: int = 3  # views completed after the first one, where it does not reach
+    extra_gain: float = 0.01  # share of the hole that an extra reference must still find open
     random_seed: int = 0
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(extra_references=1),
+    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
     "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
     "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
@@ -115,7 +117,7 @@ class Picture:
     image: np.ndarray  # [H, W, 3] uint8, the view
     data: tuple[
         np.ndarray, ...
-    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
 
 
 @dataclass(frozen=True)
@@ -221,10 +223,13 @@ def remove_object(
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
+    drawn = {v.camera.id: render_bytes(kept, v.camera) for v in masks.views}
+    exposures = {v.camera.id: level_exposure(v, photos[v.camera.id], drawn[v.camera.id]) for v in masks.views}
+    levelled = {name: e.image for name, e in exposures.items()}
     painted = {
-        v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
-        for v in masks.views
+        v.camera.id: np.where(v.silhouette[..., None], drawn[v.camera.id], levelled[v.camera.id]) for v in masks.views
     }
+    del drawn
     filled, added = kept, None
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
@@ -238,7 +243,7 @@ def remove_object(
                 "" if first else f" {round_ + 1}",
                 filled,
                 open_views,
-                photos,
+                levelled,
                 painted,
                 settings,
                 reference if first else None,
@@ -255,11 +260,16 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
-        open_views = _all_still_open(open_views, filled, len(added), rules)
+        painted = _redrawn(painted, filled, masks.views, open_views)
+        open_views = _all_still_open(open_views, filled, len(added), rules, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_share(open_views, masks)
     if left > settings.extra_gain:
         run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
+    painted = {
+        name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
+        for name, v in ((v.camera.id, v) for v in masks.views)
+    }
     return _finish(run, keep, added, masks, painted, [])
 
 
@@ -291,7 +301,7 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
-    photos: dict[str, np.ndarray],  # with the object
+    photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
     wanted: str | None,
@@ -359,7 +369,7 @@ def _fill_from_one_view(
                 "rules",
                 f"Filled view {p.camera_id}",
                 p.pasted(painted[p.camera_id]),
-                (p.rule_map(*painted[p.camera_id].shape[:2]),),
+                (p.rule_map(*painted[p.camera_id].shape[:2]), p.pasted(painted[p.camera_id], p.raw)),
             )
             for p in _spread(painting.views)
         ),
@@ -461,27 +471,48 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
+def _redrawn(
+    painted: dict[str, np.ndarray], filled: Gaussians, first: Sequence[ViewMasks], open_views: Sequence[ViewMasks]
+) -> dict[str, np.ndarray]:
+    """The painted views, with the filled scene where the removal left a gap that was never to be filled.
+
+    Beside what is in front, its soft edge is no target, but the emptied scene shows through it.
+    """
+
+    def redraw(before: ViewMasks, now: ViewMasks) -> np.ndarray:
+        picture = painted[now.camera.id]
+        gap = before.silhouette & ~before.target & (before.alpha_after < 0.99)
+        return np.where(gap[..., None], render_bytes(filled, now.camera), picture) if gap.any() else picture
+
+    return dict(zip(painted, parallel_map(lambda pair: redraw(*pair), zip(first, open_views))))
+
+
 def _all_still_open(
-    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray]
+    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray], masks: MaskSettings
 ) -> tuple[ViewMasks, ...]:
-    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id]), views))
+    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id], masks), views))
 
 
-def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray) -> ViewMasks:
+def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray, masks: MaskSettings) -> ViewMasks:
     """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
 
     A pixel that a splat's edge covers but that got no colour stays open, or the next fill would continue its old one.
+    What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is
+    in front, where a splat's soft edge has the depth of neither.
     """
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
-    depth_after, alpha_after = surface_depth(filled, view.camera)
-    return replace(
-        view,
-        target=view.target & (~covered | (rules == Rule.UNREACHED)),
-        depth_after=depth_after,
-        alpha_after=alpha_after,
-    )
+    depth, alpha = surface_depth(filled, view.camera)
+    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > masks.solid)
+    target = view.target & (~covered | (rules == Rule.UNREACHED))
+    side = 2 * masks.margin + 1
+    farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))
+    nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
+    at_edge = nearest < (1 - masks.layer_step) * depth
+    joined = coloured & (alpha > masks.solid) & (at_edge | (depth < (1 + masks.layer_step) * farthest))
+    wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side - 1, side - 1), np.uint8)) > 0
+    return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
 
 
 def _spread(items: Sequence[R], count: int = 3) -> list[R]:
