@@ -67,7 +67,7 @@ def tables(rows: Sequence[Row]) -> str:
 
 def pareto(rows: Sequence[Row]) -> str:
     """Quality against CPU seconds: one bubble per preset, ablation and baseline; its area is the Gaussians added."""
-    chosen = [r for r in rows if r["group"] in HUES]
+    chosen = [r for r in rows if r["group"] in HUES and r["method"] != "hole open"]  # far below all others
     scenes = list(dict.fromkeys(r["scene"] for r in chosen))
     wide, high = 470, 330
     columns = 2
@@ -78,7 +78,7 @@ def pareto(rows: Sequence[Row]) -> str:
     lines = math.ceil(len(scenes) / columns)
     height = 110 + lines * (high + 90)
     subtitle = "PSNR where no view looks, against CPU seconds of all threads; area: Gaussians added"
-    return page(columns * (wide + 60) + 40, height, "Speed and accuracy of whole removals", subtitle, parts)
+    return page(columns * (wide + 60) + 60, height, "Speed and accuracy of whole removals", subtitle, parts)
 
 
 def _bubbles(scene: str, rows: Sequence[Row], left: float, top: float, wide: float, high: float) -> list[str]:
@@ -90,15 +90,15 @@ def _bubbles(scene: str, rows: Sequence[Row], left: float, top: float, wide: flo
     ticks = {t: f"{t:g}" for t in (1, 2, 5, 10, 20, 50, 100, 200, 500) if x.low <= t <= x.high}
     step = max(1, math.ceil((top_value - low) / 6))
     parts = frame(scene, x, y, ticks, {v: str(v) for v in range(low, top_value + 1, step)}, "CPU seconds", "dB")
-    lowest = math.inf
-    for row in sorted(rows, key=lambda r: r["psnr unseen"]):
+    lowest = -math.inf
+    for row in sorted(rows, key=lambda r: -r["psnr unseen"]):
         hue = HUES[row["group"]]
         px, py = x.place(max(row["seconds"], 1.0)), y.place(row["psnr unseen"])
         radius = max(2.5, 0.14 * math.sqrt(row["added"]))
         parts.append(
             f'<circle cx="{px:.1f}" cy="{py:.1f}" r="{radius:.1f}" fill="{hue}" fill-opacity="0.45" stroke="{hue}"/>'
         )
-        lowest = min(py + 4, lowest - 13)
+        lowest = max(py + 4, lowest + 13)
         parts.append(
             f'<path d="M{px:.1f} {py:.1f}L{left + wide + 8:.1f} {lowest - 4:.1f}" stroke="{hue}" stroke-opacity="0.3"/>'
         )
@@ -116,7 +116,7 @@ def parsimony(average: Sequence[Row]) -> str:
         ("Highest SH degree", list(range(len(degrees))), degrees, False),
     )
     for k, (label, across, rows, logarithmic) in enumerate(panels):
-        left = 90 + 460 * k
+        left = 90 + 520 * k
         values = [r[m] for r in (*counts, *degrees) for m in ("psnr mask", "psnr unseen")]
         low, high = math.floor(min(values)), math.ceil(max(values))
         y = Axis(low, high, 380, 110, logarithmic=False)
@@ -132,4 +132,4 @@ def parsimony(average: Sequence[Row]) -> str:
                 text(x.place(across[-1]) + 8, y.place(rows[-1][metric]) + 4, words, colour=hue, size=12, weight=600)
             )
     parts.append(text(90, 450, "Closed form alone, not refined; means over the scenes.", colour=FAINT))
-    return page(1000, 470, "How many Gaussians, and of which degree, a hole needs", "", parts)
+    return page(1080, 470, "How many Gaussians, and of which degree, a hole needs", "", parts)
