@@ -357,6 +357,7 @@ def _summary(
             **_cost(file, result.added),
             "views": result.views,
             "hole_pixels": result.hole_pixels,
+            "open_pixels": result.open_pixels,
         },
         "selection": result.selection,
         "references": [asdict(choice) for choice in result.references],

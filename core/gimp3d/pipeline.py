@@ -50,6 +50,7 @@ from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
 R = TypeVar("R")
+NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class RemovalResult:
     added: Gaussians | None
     stages: tuple[StageReport, ...] = ()
     hole_pixels: int = 0
+    open_pixels: int = 0  # of these, what no reference reached
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
@@ -234,7 +236,7 @@ def remove_object(
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
-        if round_ and _open_share(open_views, masks) < settings.extra_gain:
+        if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
         try:
@@ -250,9 +252,10 @@ def remove_object(
                 reference_image if first else None,
             )
         except IllPosed as error:
-            if first:
+            touched = sum(int(v.silhouette.sum()) for v in masks.views)
+            if first and masks.hole_pixels > NEGLIGIBLE * touched:
                 raise
-            run.warnings.append(f"no further reference view helps: {error}")
+            run.warnings.append(f"no {'' if first else 'further '}reference view helps: {error}")
             break
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
@@ -263,14 +266,15 @@ def remove_object(
         painted = _redrawn(painted, filled, masks.views, open_views)
         open_views = _all_still_open(open_views, filled, len(added), rules, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
-    left = _open_share(open_views, masks)
-    if left > settings.extra_gain:
-        run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
+    left = _open_pixels(open_views)
+    if left > settings.extra_gain * masks.hole_pixels:
+        share = left / masks.hole_pixels
+        run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
     painted = {
         name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
         for name, v in ((v.camera.id, v) for v in masks.views)
     }
-    return _finish(run, keep, added, masks, painted, [])
+    return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
 def _refined(
@@ -520,8 +524,8 @@ def _spread(items: Sequence[R], count: int = 3) -> list[R]:
     return [items[k * len(items) // count] for k in range(min(count, len(items)))]
 
 
-def _open_share(open_views: Sequence[ViewMasks], masks: Masks) -> float:
-    return sum(int(v.target.sum()) for v in open_views) / max(1, masks.hole_pixels)
+def _open_pixels(open_views: Sequence[ViewMasks]) -> int:
+    return sum(int(v.target.sum()) for v in open_views)
 
 
 def render_bytes(
