@@ -34,7 +34,7 @@ lint: $(READY)
 
 bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
 	bench-pareto
-	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
+	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
