@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -227,13 +228,19 @@ def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, impor
 
 
 @pytest.mark.slow
-def test_a_million_splats_are_read_in_seconds(few_gaussians: Gaussians, tmp_path: Path) -> None:
-    import time
-
+def test_a_million_splats_come_and_go_in_two_seconds_each(few_gaussians: Gaussians, tmp_path: Path) -> None:
+    """Processor time, the better of two: the first touches memory that the machine has yet to hand out."""
     write_gaussians(tmp_path / "big.ply", few_gaussians.take(np.arange(1_000_000) % 50))
-    start = time.perf_counter()
-    bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "big.ply"))
-    assert time.perf_counter() - start < 10
+    spent = {"import": [], "export": []}
+    for _ in range(2):
+        start = time.process_time()
+        bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "big.ply"))
+        spent["import"].append(time.process_time() - start)
+        start = time.process_time()
+        bpy.ops.gimp3d.export_ply(filepath=str(tmp_path / "out.ply"))
+        spent["export"].append(time.process_time() - start)
+    assert {k: min(v) < 2 for k, v in spent.items()} == {"import": True, "export": True}, spent
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "big.ply").read_bytes()
 
 
 @pytest.mark.parametrize(
