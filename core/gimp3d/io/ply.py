@@ -335,7 +335,8 @@ def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
     rest = sum(bool(re.fullmatch(r"f_rest_\d+", n)) for n in names)
     if rest not in (0, 9, 24, 45):
         raise BadInput(f"{path}: {rest} f_rest properties; 0, 9, 24 or 45 expected (SH degree 0–3)")
-    higher = [f"f_rest_{c * (rest // 3) + k}" for k in range(rest // 3) for c in range(3)]  # the file's are channel-major
+    # the file is channel-major, Gaussians are coefficient-major
+    higher = [f"f_rest_{c * (rest // 3) + k}" for k in range(rest // 3) for c in range(3)]
     return Gaussians(
         means=columns(["x", "y", "z"]),
         log_scales=columns([f"scale_{k}" for k in range(scale_count)]),
