@@ -25,6 +25,8 @@ VIEWS = (
     ("COLLECTION", "Collection", "The cameras in one collection are the views"),
     ("ANIMATED", "Animated camera", "Every frame of the active camera is a view"),
 )
+INPAINT = ("exemplar", "shiftmap", "telea", "ns")
+SURFACES = ("auto", "harmonic", "planar")
 
 
 class GIMP3D_PG_region(bpy.types.PropertyGroup):
@@ -42,9 +44,15 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="The Gaussian splat object to remove something from",
         poll=lambda _, candidate: splats.is_splat(candidate),
     )
-    rois: CollectionProperty(type=GIMP3D_PG_region, name="Boxes", description="The active cube if empty")
-    views: EnumProperty(items=VIEWS, name="Views", default="ALL")
-    view_collection: PointerProperty(type=bpy.types.Collection, name="Collection")
+    rois: CollectionProperty(
+        type=GIMP3D_PG_region, name="Boxes", description="Boxes round the object; the active cube if empty"
+    )
+    views: EnumProperty(
+        items=VIEWS, name="Views", default="ALL", description="From where the scene is looked at and mended"
+    )
+    view_collection: PointerProperty(
+        type=bpy.types.Collection, name="Collection", description="Its cameras are the views"
+    )
     reference: PointerProperty(
         type=bpy.types.Object,
         name="Reference",
@@ -56,21 +64,40 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="The reference view without the object, painted in any tool",
         subtype="FILE_PATH",
     )
-    preset: EnumProperty(items=PRESETS, name="Preset", default="balanced")
+    preset: EnumProperty(
+        items=PRESETS, name="Preset", default="balanced", description="How much work is spent on the hole"
+    )
+    reference_paint: PointerProperty(
+        type=bpy.types.Image,
+        name="Painted",
+        description="The reference view without the object, painted in Blender's Image Editor",
+    )
     inpaint: StringProperty(
         name="Fill",
         default="exemplar",
-        description="What invents the never-seen part: exemplar, telea, ns, shiftmap, file:PATH or command:CMD",
+        description="What invents the part that no view shows: one of the list, or file:PATH, or command:CMD",
+        search=lambda _, context, text: INPAINT,
+        search_options={"SUGGESTION"},
     )
     depth_prior: StringProperty(
         name="Surface",
         default="auto",
-        description="How the hidden surface goes on: auto, harmonic, planar, file:PATH",
+        description="How the hidden surface goes on: one of the list, or file:PATH, or onnx:PATH",
+        search=lambda _, context, text: SURFACES,
+        search_options={"SUGGESTION"},
     )
-    seed: IntProperty(name="Seed", default=0, min=0)
-    progress: FloatProperty(min=0, max=1, options={"SKIP_SAVE"})
-    status: StringProperty(options={"SKIP_SAVE"})
-    last_report: StringProperty(name="Report", subtype="FILE_PATH")
+    seed: IntProperty(name="Seed", default=0, min=0, description="Another number invents other details")
+    pace: FloatProperty(
+        name="Pace",
+        default=1.0,
+        min=0.01,
+        description="The last run's time over its forecast: later forecasts are multiplied by it",
+    )
+    hole: StringProperty(name="Hole", description="Size of what was or will be filled, as last measured")
+    last_job: StringProperty(name="Job", subtype="FILE_PATH", description="Folder of the last removal")
+    last_report: StringProperty(
+        name="Report", subtype="FILE_PATH", description="What each stage of the last removal did, as a web page"
+    )
 
 
 class GIMP3D_preferences(bpy.types.AddonPreferences):

@@ -17,7 +17,10 @@ from mathutils import Matrix
 
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, Gaussians
-from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussians_of, row_blocks, values
+from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
+from gimp3d.solvers.harmonics import sh_basis
+
+from .native import attribute_values, is_native, read_native, write_native
 
 T = TypeVar("T")
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
@@ -34,8 +37,34 @@ UP_AXES = {
 
 
 def is_splat(candidate: bpy.types.Object | None) -> bool:
-    """Whether an object was made by `create_object`."""
-    return candidate is not None and candidate.type == "MESH" and TABLE in candidate.data
+    """Whether an object was made by `create_object`, or is one of Blender's own splat objects."""
+    ours = candidate is not None and candidate.type == "MESH" and TABLE in candidate.data
+    return ours or is_native(candidate)
+
+
+def count(obj: bpy.types.Object) -> int:
+    """How many splats an object has."""
+    return len(obj.data.vertices) if obj.type == "MESH" else len(obj.data.attributes["position"].data)
+
+
+def kind(obj: bpy.types.Object) -> str:
+    """What an object holds, for the panel."""
+    if is_native(obj):
+        return "Blender's own splats"
+    names = [name for name, _ in json.loads(obj.data[TABLE])["properties"]]
+    degree = round((1 + sum(n.startswith("f_rest_") for n in names) / 3) ** 0.5) - 1
+    return f"{'3DGS' if 'scale_2' in names else '2DGS'}, SH degree {degree}"
+
+
+def positions(obj: bpy.types.Object) -> np.ndarray:
+    """The splats' centres in the object's frame, [N, 3] float32."""
+    return attribute_values(obj.data, "position") if obj.type != "MESH" else _vertices(obj.data)
+
+
+def _vertices(mesh: bpy.types.Mesh) -> np.ndarray:
+    points = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", points)
+    return points.reshape(-1, 3)
 
 
 def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Object:
@@ -63,12 +92,58 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     obj.matrix_world = matrix
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
-    modifier[_socket("As Points")] = len(gaussians) > MANY
+    modifier[socket_of("As Points")] = len(gaussians) > MANY
     return obj
+
+
+def create_like(source: bpy.types.Object, name: str, file: SplatFile) -> bpy.types.Object:
+    """A new object (not yet linked) in the source's place and of its kind, shown as the source is."""
+    if is_native(source) and hasattr(source.data, "resize"):  # Blender ≥ 5.2
+        data = source.data.copy()
+        data.resize(len(file.gaussians))
+        write_native(data, file.gaussians)
+        result = bpy.data.objects.new(name, data)
+        result.matrix_world = source.matrix_world.copy()
+        return result
+    result = create_object(name, file, source.matrix_world.copy())
+    shown, before = display(result), display(source)
+    if shown is not None and before is not None:
+        for socket in ("As Points", "Fraction"):
+            shown[socket_of(socket)] = before[socket_of(socket)]
+    return result
+
+
+def display(obj: bpy.types.Object) -> bpy.types.Modifier | None:
+    """The modifier that shows the splats; its inputs are `socket_of("As Points")` and `socket_of("Fraction")`."""
+    return next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == node_group()), None)
+
+
+def show_colours_from(obj: bpy.types.Object, eye: np.ndarray) -> None:
+    """Bake the SH colours as seen from a point in the object's frame: a material can read too few attributes for SH."""
+    gaussians = read_object(obj).gaussians
+    encoded = np.empty((len(gaussians), 3), np.float32)
+    for rows in row_blocks(len(gaussians)):
+        towards = gaussians.means[rows] - np.asarray(eye, np.float32)
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+        basis = sh_basis(towards, gaussians.sh_degree)
+        encoded[rows] = 0.5 + np.einsum("nk,nkc->nc", basis, gaussians.sh[rows])
+    colours = _shown_colours(encoded)
+    colours[~gaussians.usable] = 0
+    obj.data.attributes[COLOUR].data.foreach_set("color", colours.ravel())
+    obj.data.update_tag()
+
+
+def _shown_colours(encoded: np.ndarray) -> np.ndarray:
+    """Gamma-encoded colours as Blender's linear ones with alpha, [N, 4] float32."""
+    encoded = np.clip(encoded, 0, 1)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
 
 
 def read_object(obj: bpy.types.Object) -> SplatFile:
     """The file that an object came from, without the vertices that were deleted since."""
+    if is_native(obj):
+        return file_of(read_native(obj.data))
     if obj.mode == "EDIT":  # there the mesh shows no attributes; a copy of it does
         obj.update_from_editmode()
         copy = obj.data.copy()
@@ -103,9 +178,7 @@ def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
 
 def _refuse_moved(mesh: bpy.types.Mesh, gaussians: Gaussians) -> None:
     """After Apply Transform the mesh is no longer in the file's frame, and cameras and boxes would miss it."""
-    shown = np.empty(3 * len(gaussians), np.float32)
-    mesh.vertices.foreach_get("co", shown)
-    if not np.array_equal(shown.reshape(-1, 3), np.where(gaussians.usable[:, None], gaussians.means, 0)):
+    if not np.array_equal(_vertices(mesh), np.where(gaussians.usable[:, None], gaussians.means, 0)):
         raise BadInput(f"{mesh.name}: vertices were moved, or a transform was applied; undo that and move the object")
 
 
@@ -171,15 +244,12 @@ def _store_display(mesh: bpy.types.Mesh, gaussians: Gaussians, usable: np.ndarra
         scales = np.concatenate([scales, 1e-3 * scales.min(1, keepdims=True)], axis=1)
     norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     quats = gaussians.quats / np.where(norms > 0, norms, 1)
-    encoded = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     hide = ~usable
-    shown = np.concatenate([linear, np.ones((len(linear), 1))], axis=1)
     for name, kind, key, array in (
         ("scale", "FLOAT_VECTOR", "vector", scales),
         ("rotation", "QUATERNION", "value", quats),
         ("opacity", "FLOAT", "value", gaussians.opacity),
-        (COLOUR, "FLOAT_COLOR", "color", shown),
+        (COLOUR, "FLOAT_COLOR", "color", _shown_colours(0.5 + SH_C0 * gaussians.sh[:, 0])),
     ):
         clean = np.array(array, np.float32)
         clean[hide] = 0
@@ -251,7 +321,8 @@ def node_group() -> bpy.types.NodeTree:
     return tree
 
 
-def _socket(name: str) -> str:
+def socket_of(name: str) -> str:
+    """The modifier's key of an input of the node group."""
     return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
 
 

@@ -1,7 +1,7 @@
 """What a removal will cost, told before it starts, and how far a running one is.
 
-The constants are measured (4 laptop cores, kernels compiled; the demo, four made scenes of 50,000 Gaussians and 24–36
-views of 480×270, a scan of 125,000): good to a factor of two. Who runs removals multiplies by their own last run's pace.
+The constants are measured (4 cores, kernels compiled; the demo and the desk scene, 50,000 Gaussians and 24–36 views of
+480×270, and a scan of 125,000): good to a factor of two. Who runs removals multiplies by their own last run's pace.
 """
 
 from __future__ import annotations

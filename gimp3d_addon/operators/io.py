@@ -14,7 +14,7 @@ from gimp3d.io.formats import read_scene
 from gimp3d.io.ply import write_ply
 
 from .. import splats
-from .base import ReportsErrors, current_splat, link
+from .base import ReportsErrors, current_splat, link, select_only
 
 UP_ITEMS = (
     ("FILE", "As in the file", "Keep the file's axes"),
@@ -41,12 +41,9 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
             self.report({"WARNING"}, "elements other than vertex are not kept")
         obj = splats.create_object(splats.default_name(path), file, splats.UP_AXES[self.up])
         link(context, obj)
-        for other in context.selected_objects:
-            other.select_set(False)
-        obj.select_set(True)
-        context.view_layer.objects.active = obj
+        select_only(context, obj)
         context.scene.gimp3d.splat = obj
-        self.report({"INFO"}, f"{len(file.gaussians)} Gaussians, SH degree {file.gaussians.sh_degree}")
+        self.report({"INFO"}, f"{len(file.gaussians):,} Gaussians, SH degree {file.gaussians.sh_degree}")
 
 
 class GIMP3D_OT_export_ply(ReportsErrors, bpy.types.Operator, ExportHelper):
