@@ -214,6 +214,20 @@ def test_a_second_object_is_removed_from_the_result(splat: bpy.types.Object, tmp
     assert len(means) and (np.abs(means[:, :2]) < 0.2).all(1).any()  # what the first run filled is kept
 
 
+def test_undo_takes_a_removal_back_and_redo_brings_it_again(splat: bpy.types.Object) -> None:
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.gimp3d.remove_object()
+    bpy.ops.ed.undo_push(message="Remove Object")
+    name = splat.name
+    count = splats.count(current_splat(bpy.context))
+    bpy.ops.ed.undo()
+    (source,) = splat_objects()
+    assert source.name == name and not source.hide_get() and current_splat(bpy.context) == source
+    bpy.ops.ed.redo()
+    assert len(splat_objects()) == 2 and splats.count(current_splat(bpy.context)) == count
+    assert bpy.ops.gimp3d.restore() == {"FINISHED"}
+
+
 def test_saving_closing_and_reopening_keeps_everything(splat: bpy.types.Object, tmp_path: Path) -> None:
     bpy.ops.gimp3d.choose_reference(camera="orbit/001")
     bpy.context.scene.gimp3d.preset = "draft"
