@@ -108,11 +108,22 @@ class GIMP3D_preferences(bpy.types.AddonPreferences):
     python: StringProperty(
         name="Python",
         subtype="FILE_PATH",
-        description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with the bundled wheels",
+        description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with what the extension brings",
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.prop(self, "python")
+        from .operators.environment import USES, GIMP3D_OT_check  # it needs this module
+
+        layout = self.layout
+        layout.label(text="Remove runs in a Python of its own, so that Blender stays free.")
+        layout.prop(self, "python")
+        row = layout.row()
+        row.operator("gimp3d.make_environment", icon="IMPORT")
+        row.operator("gimp3d.check", icon="CHECKMARK")
+        for name, version in GIMP3D_OT_check.found.items():
+            there = bool(version) and not version.startswith("broken")
+            text = f"{name} {version or 'missing'}" + (f", {USES[name]}" if name in USES else "")
+            layout.label(text=text, icon="CHECKMARK" if there else "INFO" if name in USES else "ERROR")
 
 
 CLASSES = (GIMP3D_PG_region, GIMP3D_PG_settings, GIMP3D_preferences)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import queue
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -42,7 +43,17 @@ entry_point()
 def child_command(arguments: Sequence[str], python: str = "") -> list[str]:
     """The command line that runs `gimp3d arguments` in a chosen Python, or in Blender's own."""
     folder = Path(gimp3d.__file__).resolve().parents[1]
-    return [python or sys.executable, "-X", "utf8", "-c", BOOT, str(folder), *arguments]
+    return [python or own_python(), "-X", "utf8", "-c", BOOT, str(folder), *arguments]
+
+
+def own_python() -> str:
+    """Blender's own interpreter; in some builds `sys.executable` is Blender itself."""
+    if Path(sys.executable).name.lower().startswith("python"):
+        return sys.executable
+    found = shutil.which(f"python{sys.version_info[0]}.{sys.version_info[1]}", path=str(Path(sys.prefix) / "bin"))
+    if found is None:
+        raise BadInput("Blender's own Python was not found; choose one in the preferences of 3D-GIMP")
+    return found
 
 
 class Killed(Gimp3dError):

@@ -60,7 +60,8 @@ def install_and_run(zip_path: Path, folder: Path, python: Path, environment: dic
 
 
 def build(*arguments: str) -> Path:
-    subprocess.run([sys.executable, str(ROOT / "scripts" / "build_extension.py"), *arguments], check=True)
+    command = [sys.executable, str(ROOT / "scripts" / "build_extension.py"), "--platform", "here", *arguments]
+    subprocess.run(command, check=True)
     return max((ROOT / "dist").glob("gimp3d-*.zip"), key=lambda p: p.stat().st_mtime)
 
 
