@@ -98,7 +98,11 @@ class GIMP3D_PT_display(Advanced, bpy.types.Panel):
     bl_parent_id = "GIMP3D_PT_scene"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, splat = self.layout, current_splat(context)
+        layout, splat, view = self.layout, current_splat(context), context.space_data
+        if view is not None and view.shading.type in ("SOLID", "WIREFRAME"):
+            say(layout, "Solid view shows no colours:", "INFO")
+        if view is not None:
+            layout.row(align=True).prop(view.shading, "type", expand=True)
         shown = splats.display(splat) if splat is not None else None
         if shown is not None:
             for name, text in (("As Points", "Points in Viewport"), ("Fraction", "Share of Splats")):
