@@ -54,8 +54,10 @@ bench-propagate: $(READY)
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
 
+# in a real Blender with its window, on a virtual screen: root on Debian, see scripts/screenshots.py
 screenshots: demo
 	cp build/demo/before_after.png assets/before_after.png
+	$(BIN)/python scripts/screenshots.py
 
 clean:
 	rm -rf build dist $(VENV)

@@ -45,6 +45,7 @@ def take_away(camera: bpy.types.Object) -> bool:
     ours = [s for s in slots if s.display_depth == "FRONT" and (s.image is None or s.image.name.startswith(OURS))]
     for slot in ours:
         slots.remove(slot)
+    camera.data.update_tag()  # the view goes on drawing them otherwise
     return bool(ours)
 
 

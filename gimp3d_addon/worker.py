@@ -92,6 +92,7 @@ class Worker:
         self.progress = 0.0
         self.status = "starting"
         self.cancelled = False
+        self.compiled = False  # the first run on a machine: its time says nothing of the next one's
         self.summary: dict[str, Any] | None = None
         self._error = ""
 
@@ -171,6 +172,7 @@ class Worker:
         elif "done" in said:
             self.progress = said["done"] / max(1, said["total"])
             self.status = said["stage"] if said["total"] == 1 else f"{said['stage']} {said['done']}/{said['total']}"
+            self.compiled = self.compiled or said["stage"] == "compile"
             if self._clock is not None:
                 self._clock.take(said["stage"], said["done"], said["total"])
                 self.progress = self._clock.fraction

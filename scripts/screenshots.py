@@ -10,16 +10,18 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOL = ROOT.parent / "shared" / "tools" / "real-blender"
-DISPLAY, SIZE = ":77", "1500x940"
+DISPLAY, SIZE = ":77", "1500x1060"
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 PATIENCE = 900  # s for the whole session
 
@@ -56,12 +58,15 @@ def session(tool: Path, root: Path, out: Path) -> None:
     shutil.copy2(ROOT / "scripts" / "screenshots_ui.py", share)
     inside = [str(tool), "run", str(root), "env", f"DISPLAY={DISPLAY}", "LIBGL_ALWAYS_SOFTWARE=1"]
     inside += ["GIMP3D_SHARE=/share", "GIMP3D_PYTHON=/root/gimp/bin/python", "BLENDER_USER_RESOURCES=/share/user"]
-    screen = subprocess.Popen([*inside, "Xvfb", DISPLAY, "-screen", "0", f"{SIZE}x24", "+extension", "GLX"])
+    xvfb = [*inside, "Xvfb", DISPLAY, "-screen", "0", f"{SIZE}x24", "+extension", "GLX"]
+    screen = subprocess.Popen(xvfb, start_new_session=True)
     time.sleep(2)
     width, height = SIZE.split("x")
     blender = ["blender", "--window-geometry", "0", "0", width, height, "--no-window-focus"]
     with (share / "blender.log").open("w") as log:
-        window = subprocess.Popen([*inside, *blender, "--python", "/share/screenshots_ui.py"], stdout=log, stderr=log)
+        window = subprocess.Popen(
+            [*inside, *blender, "--python", "/share/screenshots_ui.py"], stdout=log, stderr=log, start_new_session=True
+        )
     out.mkdir(parents=True, exist_ok=True)
     start, finished = time.monotonic(), share / "finished"
     try:
@@ -76,8 +81,9 @@ def session(tool: Path, root: Path, out: Path) -> None:
                 ready.unlink()
             time.sleep(0.5)
     finally:
-        window.terminate()
-        screen.terminate()
+        for process in (window, screen):  # with what runs inside of the chroot
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
     if finished.read_text() != "well":
         sys.exit(f"screenshots: {finished.read_text()}")
 

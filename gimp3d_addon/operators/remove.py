@@ -42,8 +42,8 @@ class RunsRemoval(RunsChild):
         result = bring_back(context, self.folder)
         jobs.close(self.folder)
         settings, seconds = context.scene.gimp3d, summary["seconds_total"]
-        if self._told:
-            settings.pace = seconds / self._told
+        if self._told and not self.worker.compiled:
+            settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever
         report = self.folder / "report" / "index.html"
         settings.last_report = str(report) if report.exists() else ""
         for warning in summary["warnings"]:

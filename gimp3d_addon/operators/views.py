@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 from mathutils import Matrix, Vector
@@ -19,6 +20,7 @@ from .. import backdrops, bridge
 from .base import ReportsErrors, current_boxes, current_splat, link
 
 COLLECTION = "3D-GIMP views"
+DISPLAY_SHARE = 0.1  # of the cameras' spread: their frames are drawn so large that they do not hide the scene
 
 
 def add_cameras(
@@ -28,8 +30,11 @@ def add_cameras(
     collection = bpy.data.collections.new(COLLECTION)
     context.scene.collection.children.link(collection)
     frame = Matrix(bridge.splat_frame(splat).tolist())
+    apart = np.std([c.centre for c in cameras], axis=0).max() * frame.median_scale
     for camera in cameras:
         obj = bridge.camera_to_blender(camera, frame)
+        if len(cameras) > 1:
+            obj.data.display_size = max(1e-6, DISPLAY_SHARE * apart)
         link(context, obj, collection)
         photo = bridge.photo_of(obj)
         if backgrounds and photo is not None:
