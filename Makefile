@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate extension \
-	screenshots clean
+.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
+	bench-harmonics extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -32,7 +32,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth
+bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -50,6 +50,10 @@ bench-depth: $(READY)
 
 bench-propagate: $(READY)
 	$(BIN)/python scripts/bench_propagate.py $(DATA)
+
+# with DATA, also what the fit brings to removals: ten minutes more
+bench-harmonics: $(READY)
+	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

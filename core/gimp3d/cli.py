@@ -102,7 +102,7 @@ def build_parser() -> argparse.ArgumentParser:
     orbit.add_argument("--roi", required=True)
     orbit.add_argument("--out", required=True, metavar="CAMS.json")
     orbit.add_argument("--views", type=int, default=24)
-    orbit.add_argument("--up", default="0,0,1", metavar="X,Y,Z")
+    orbit.add_argument("--up", metavar="X,Y,Z", help="default: away from the floor under the region")
     orbit.add_argument("--size", default="960x540", metavar="WxH")
     orbit.add_argument("--fov", type=float, default=50.0, metavar="DEG", help="horizontal")
 
@@ -280,16 +280,17 @@ def _orbit(given: Namespace, _: Reporter) -> None:
     size = re.fullmatch(r"(\d+)x(\d+)", given.size)
     if not size:
         raise BadInput(f"--size: WIDTHxHEIGHT expected, got {given.size!r}")
-    write_orbit(
+    up, why = write_orbit(
         Path(given.scene),
         Path(given.roi),
         Path(given.out),
         views=given.views,
-        up=_numbers(given.up, 3, "--up"),
+        up=_numbers(given.up, 3, "--up") if given.up is not None else None,
         width=int(size[1]),
         height=int(size[2]),
         fov_degrees=given.fov,
     )
+    print(f"{given.out}: {given.views} cameras; up is {up[0]:.2f},{up[1]:.2f},{up[2]:.2f} ({why})")
 
 
 def _evaluate(given: Namespace, _: Reporter) -> None:

@@ -23,7 +23,7 @@ from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
-from .orbit import orbit_cameras
+from .orbit import measured_up, orbit_cameras
 from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
@@ -181,15 +181,21 @@ def write_orbit(
     roi: Path,
     out: Path,
     views: int = 24,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
+    up: Sequence[float] | None = None,
     width: int = 960,
     height: int = 540,
     fov_degrees: float = 50.0,
-) -> None:
-    """Write cameras round a region, for a scene that has none (CONTRACT: orbit)."""
-    read_scene(scene)  # a wrong file should be refused now, not when the cameras are used
-    cameras = orbit_cameras(read_region(roi), views, tuple(up), width, height, fov_degrees)  # type: ignore[arg-type]
-    write_transforms(out, cameras)
+) -> tuple[np.ndarray, str]:
+    """Write cameras round a region, for a scene that has none (CONTRACT: orbit); returns what is up, and why."""
+    gaussians, region = read_scene(scene).gaussians, read_region(roi)
+    axis: Any = up
+    why = "as given"
+    if axis is None:
+        axis, why = measured_up(gaussians, region), "away from the floor under the region"
+    if axis is None:
+        axis, why = np.array([0.0, 0.0, 1.0]), "no floor found; give --up if it is another direction"
+    write_transforms(out, orbit_cameras(region, views, tuple(axis), width, height, fov_degrees))
+    return axis, why
 
 
 def run_removal(

@@ -7,12 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .box import Box
+from .box import Box, in_region
 from .camera import Camera
 from .errors import BadInput
+from .gaussians import Gaussians
 
 ELEVATIONS = (15.0, 35.0, 60.0)  # degrees above the floor; each ring's cameras stand between the last ring's
 FILL = 0.4  # share of the smaller image side that the region's bounding sphere takes
+NEARBY = 4.0  # radii of the region round its centre within which its floor is sought
+FLAT = 0.03  # of the radius: distance up to which a Gaussian lies on a plane
+SUNK = 0.25  # share of a region's height that its boxes may reach below its floor
+LEAST_FLOOR = 0.15  # share of the Gaussians round the region that a floor holds
+SAMPLED, TRIES = 4000, 500  # Gaussians looked at, planes tried
 
 
 def orbit_cameras(
@@ -60,6 +66,43 @@ def orbit_cameras(
         viewmat = look_at(centre + distance * away, centre, axis)
         cameras.append(Camera(f"orbit/{k:03d}", width, height, focal, focal, width / 2, height / 2, viewmat, "train"))
     return tuple(cameras)
+
+
+def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
+    """The unit normal, towards the region, of the floor under it; None where no plane is found that it stands clear of.
+
+    RANSAC (Fischler & Bolles 1981) with a fixed seed over the solid Gaussians round the region. Of the planes that hold
+    at least half as many as the best one the nearest is the floor: an object touches it rather than the walls.
+    """
+    corners = np.concatenate([box.corners() for box in region])
+    centre = (corners.min(0) + corners.max(0)) / 2
+    radius = float(np.linalg.norm(corners - centre, axis=1).max())
+    means = scene.means.astype(np.float64)
+    near = (np.linalg.norm(means - centre, axis=1) < NEARBY * radius) & ~in_region(region, means)
+    points = means[near & (scene.opacity_logits > 0)]
+    points = (points[:: len(points) // SAMPLED + 1] - centre) / radius
+    if len(points) < 10:
+        return None
+    picks = points[np.random.default_rng(0).integers(len(points), size=(TRIES, 3))]
+    normals = np.cross(picks[:, 1] - picks[:, 0], picks[:, 2] - picks[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    proper = lengths > 1e-6
+    normals = normals[proper] / lengths[proper, None]
+    offsets = (normals * picks[proper, 0]).sum(1)
+    towards = np.where(offsets > 0, -1.0, 1.0)  # the region's centre is the origin
+    normals, offsets = normals * towards[:, None], offsets * towards
+    heights = normals @ ((corners - centre) / radius).T - offsets[:, None]
+    lowest = heights.min(1)
+    stands = lowest >= -SUNK * (heights.max(1) - lowest)
+    held = np.array([(np.abs(points @ n - d) < FLAT).mean() for n, d in zip(normals, offsets)])
+    held = np.where(stands, held, 0.0)
+    if not held.size or held.max() < LEAST_FLOOR:
+        return None
+    large = np.flatnonzero(held >= held.max() / 2)
+    best = large[np.argmin(np.abs(lowest[large]))]
+    on = points[np.abs(points @ normals[best] - offsets[best]) < FLAT]
+    normal = np.linalg.svd(on - on.mean(0), full_matrices=False)[2][2]
+    return normal * (1.0 if normal @ normals[best] > 0 else -1.0)
 
 
 def look_at(

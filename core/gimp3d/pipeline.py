@@ -18,6 +18,7 @@ from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
+from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
@@ -75,7 +76,7 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(sh_degree=3, ridge=1e-3),
+        seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         use_evidence=False,
         extra_references=0,
     ),

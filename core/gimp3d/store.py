@@ -24,7 +24,7 @@ class StageStore:
         self.kinds = {kind.__name__: kind for kind in kinds}
 
     def load(self, name: str) -> Any | None:
-        """The stage's stored result, or None if there is none of this key or it is damaged."""
+        """The stage's stored result, or None if there is none of this key, it is damaged or no longer understood."""
         path = self._path(name)
         if not self.resume or not path.exists():
             return None
@@ -36,7 +36,10 @@ class StageStore:
             return None  # a crash in the middle of an older version's write; the stage simply runs again
         if document["key"] != self.key:
             return None
-        return self._decode(document["result"], arrays)
+        try:
+            return self._decode(document["result"], arrays)
+        except (KeyError, TypeError):
+            return None  # stored before a kind of result got other fields
 
     def save(self, name: str, result: Any) -> None:
         """Store a result made of dataclasses, tuples, arrays, strings, numbers and None."""

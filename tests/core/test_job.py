@@ -79,3 +79,19 @@ def test_stage_results_come_back_and_only_for_the_same_key(tmp_path: Path) -> No
     assert StageStore(tmp_path, "key", kinds, resume=False).load("some stage") is None
     (tmp_path / "some-stage.npz").write_bytes(b"damaged")
     assert StageStore(tmp_path, "key", kinds, resume=True).load("some stage") is None
+
+
+def test_a_result_of_which_the_program_no_longer_knows_the_fields_is_made_again(tmp_path: Path) -> None:
+    @dataclass(frozen=True)
+    class Kind:
+        old: int
+
+    StageStore(tmp_path, "key", (Kind,), resume=True).save("stage", Kind(1))
+
+    @dataclass(frozen=True)
+    class Newer:
+        new: int
+
+    Newer.__name__ = "Kind"
+    assert StageStore(tmp_path, "key", (Newer,), resume=True).load("stage") is None
+    assert StageStore(tmp_path, "key", (), resume=True).load("stage") is None

@@ -7,7 +7,8 @@ import pytest
 
 from gimp3d.box import Box
 from gimp3d.errors import BadInput
-from gimp3d.orbit import orbit_cameras
+from gimp3d.gaussians import Gaussians, quats_to_matrices
+from gimp3d.orbit import measured_up, orbit_cameras
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -2, 0.5)])
@@ -50,6 +51,39 @@ def test_orbits_are_the_same_every_time_and_spread_over_three_rings() -> None:
     assert {round(e) for e in np.degrees(np.arcsin(away[:, 2]))} == {15, 35, 60}
     angles = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])) % 360)
     np.testing.assert_allclose(np.diff(angles), 30, atol=1e-9)
+
+
+def splats(points: np.ndarray) -> Gaussians:
+    n = len(points)
+    quats = np.tile([1.0, 0, 0, 0], (n, 1))
+    return Gaussians(
+        means=points.astype(np.float32),
+        log_scales=np.full((n, 3), -3, np.float32),
+        quats=quats.astype(np.float32),
+        opacity_logits=np.full(n, 2, np.float32),
+        sh=np.zeros((n, 1, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_up_is_away_from_the_floor_and_not_from_a_wall(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=4)
+    turn = quats_to_matrices(quat[None])[0]
+    floor = np.column_stack([rng.uniform(-3, 3, (3000, 2)), rng.normal(0, 0.005, 3000)])
+    wall = np.column_stack([rng.uniform(-3, 3, 3000), np.full(3000, 1.2), rng.uniform(0, 3, 3000)])
+    thing = rng.uniform([-0.5, -0.5, 0], [0.5, 0.5, 1], (3000, 3))  # what is to be removed is no floor
+    box = Box.make(np.array([0, 0, 0.55]) @ turn.T + 7, [1, 1, 1], quat)
+    up = measured_up(splats(np.concatenate([floor, wall, thing]) @ turn.T + 7), (box,))
+    assert up is not None
+    np.testing.assert_allclose(up, turn[:, 2], atol=0.01)
+
+
+def test_without_a_floor_up_is_unknown() -> None:
+    cloud = np.random.default_rng(0).normal(size=(3000, 3)) * 2
+    box = (Box.make([0, 0, 0], [1, 1, 1]),)
+    assert measured_up(splats(cloud), box) is None
+    assert measured_up(splats(cloud[:3]), box) is None
 
 
 def test_an_orbit_round_nothing_is_refused() -> None:

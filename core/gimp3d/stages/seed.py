@@ -9,7 +9,8 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
-from ..solvers.harmonics import fit_anchored_sh, residual_weights
+from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
+from ..threads import parallel_map
 from .masks import sees
 from .propagate import Loader, PaintedView, Rule
 from .reference import surface_normals
@@ -23,8 +24,10 @@ class SeedSettings:
     maximum_slant: float = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
     thickness: float = 0.1  # standard deviation along the normal, as a share of the tangential one
     opacity: float = 0.98
-    sh_degree: int = 0  # of new Gaussians: on the benchmark scenes, degree 1 costs 0.5 dB in the mask and more unseen
-    ridge: float = 1.0
+    sh_degree: int = 2  # the highest of new Gaussians; each gets the one that its observations support
+    # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
+    # they share against the reference is mostly a shadow or an exposure that it has not.
+    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
     depth_tolerance: float = 0.02  # z-test of observations
 
 
@@ -75,29 +78,33 @@ def colour_gaussians(
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
     """The seeds with view-dependent colour fitted to the painted views; c_0 stays what the reference shows."""
-    degree = min(settings.sh_degree, scene_degree)
-    if degree == 0 or len(views) < 2 or not len(seeds):
-        return replace(seeds, sh=pad_sh(seeds.sh, (scene_degree + 1) ** 2))
+    degree, bands = min(settings.sh_degree, scene_degree), (scene_degree + 1) ** 2
+    if degree == 0:
+        return replace(seeds, sh=pad_sh(seeds.sh, bands))
     means = seeds.means.astype(np.float64)
-    anchor = 0.5 + SH_C0 * seeds.sh[:, 0].astype(np.float64)
-    residuals = np.zeros((len(seeds), len(views), 3), np.float32)
-    directions = np.zeros((len(seeds), len(views), 3), np.float32)
-    observed = np.zeros((len(seeds), len(views)), bool)
-    for k, (load, paint) in enumerate(zip(views, painted)):
-        view = load()
-        visible = sees(view.camera, view.depth_new, means, settings.depth_tolerance)
-        uv, _ = view.camera.project(means[visible])
-        cols, rows = uv.astype(int).T
-        rules = paint.rule_map(view.camera.height, view.camera.width)
-        trusted = np.isin(rules[rows, cols], (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED))
-        index = np.flatnonzero(visible)[trusted]
-        seen = paint.image[rows[trusted] - paint.top, cols[trusted] - paint.left]
-        residuals[index, k] = seen / 255.0 - anchor[index]
-        observed[index, k] = True
-        towards = means - view.camera.centre
-        directions[:, k] = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
-    to_reference = means - reference.centre
-    to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
-    weights = residual_weights(residuals, directions, to_reference, observed)
-    sh = fit_anchored_sh(anchor, to_reference, residuals, directions, weights, degree, settings.ridge)
-    return replace(seeds, sh=pad_sh(sh.astype(np.float32), (scene_degree + 1) ** 2))
+    seen = parallel_map(lambda pair: _seen_in(means, *pair, settings.depth_tolerance), zip(views, painted))
+    colours = 0.5 + SH_C0 * seeds.sh[:, 0].astype(np.float64)
+    observations = gather_observations(len(seeds), seen)
+    fit = fit_harmonics(colours, _towards(means, reference), observations, degree, settings.harmonics)
+    return replace(seeds, sh=pad_sh(fit.sh, bands))
+
+
+def _seen_in(
+    means: np.ndarray, load: Loader, paint: PaintedView, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of the seeds that a painted view shows by pixels of its own, the directions to them, and their colours."""
+    view = load()
+    visible = np.flatnonzero(sees(view.camera, view.depth_new, means, tolerance))
+    uv, _ = view.camera.project(means[visible])
+    cols, rows = uv.astype(int).T
+    rules = paint.rule_map(view.camera.height, view.camera.width)
+    own = np.isin(rules[rows, cols], (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED))
+    index = visible[own]
+    colours = paint.image[rows[own] - paint.top, cols[own] - paint.left] / 255.0
+    return index, _towards(means[index], view.camera), colours
+
+
+def _towards(means: np.ndarray, camera: Camera) -> np.ndarray:
+    """Unit directions from the camera to the points."""
+    towards = means - camera.centre
+    return towards / np.linalg.norm(towards, axis=-1, keepdims=True)

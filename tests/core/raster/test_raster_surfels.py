@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from brute_force import sh_basis
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_raster_render import CAMERA, one, posed, random_scene
@@ -14,6 +13,7 @@ from test_raster_render import CAMERA, one, posed, random_scene
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices
 from gimp3d.raster import PASSES, RasterSettings, Rendering, contributions, footprint, render
+from gimp3d.solvers.harmonics import rotate_sh
 
 torch = pytest.importorskip("torch")
 from torch_reference import Pictures, draw  # noqa: E402 (needs torch)
@@ -203,18 +203,6 @@ def test_contributions_and_footprints_match_the_reference() -> None:
         np.testing.assert_allclose(seen, weights[:, chosen].sum(1), atol=1e-4)
 
 
-def turned_sh(
-    sh: np.ndarray,  # [N, K, 3]
-    turn: np.ndarray,  # [3, 3]
-) -> np.ndarray:
-    """Coefficients of the colours that are seen along R d as `sh`'s are along d, by least squares over directions."""
-    towards = np.random.default_rng(0).normal(0, 1, (200, 3))
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    bands = sh.shape[1]
-    matrix = np.linalg.lstsq(sh_basis(towards @ turn.T)[:, :bands], sh_basis(towards)[:, :bands], rcond=None)[0]
-    return np.einsum("jk,nkc->njc", matrix, sh).astype(np.float32)
-
-
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("surfels", [False, True])
 def test_a_rigid_motion_of_scene_and_camera_changes_nothing(surfels: bool, degree: int) -> None:
@@ -225,7 +213,7 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing(surfels: bool, degre
         gaussians,
         means=(gaussians.means @ turn.T + shift).astype(np.float32),
         quats=matrices_to_quats(turn @ quats_to_matrices(gaussians.quats.astype(float))).astype(np.float32),
-        sh=turned_sh(gaussians.sh, turn),
+        sh=rotate_sh(gaussians.sh, turn),
     )
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = camera.R @ turn.T, camera.t - camera.R @ turn.T @ shift
