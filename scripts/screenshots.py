@@ -76,7 +76,8 @@ def session(tool: Path, root: Path, out: Path) -> None:
             for ready in share.glob("*.ready"):
                 time.sleep(6)  # llvmpipe takes its time to draw
                 run(*inside, "import", "-window", "root", f"/share/{ready.stem}.png")
-                cv2.imwrite(str(out / f"{ready.stem}.png"), cv2.imread(str(share / f"{ready.stem}.png")))
+                picture = cv2.imread(str(share / f"{ready.stem}.png"))
+                cv2.imwrite(str(out / f"{ready.stem}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
                 print(f"screenshots: {ready.stem}", flush=True)
                 ready.unlink()
             time.sleep(0.5)

@@ -113,12 +113,20 @@ def until(done) -> Iterator[str]:  # type: ignore[no-untyped-def]
 
 running = steps()
 waiting: list[Path] = []
+late: list[float] = []  # s that each timer call came after its time: how long Blender was busy
+due = [time.monotonic()]
+
+
+def timed(seconds: float) -> float:
+    due[0] = time.monotonic() + seconds
+    return seconds
 
 
 def tick() -> float | None:
     """Blender's timer: one step, or wait for the picture of the last one."""
+    late.append(max(0.0, time.monotonic() - due[0]))
     if waiting and waiting[0].exists():
-        return 0.5
+        return timed(0.25)
     waiting.clear()
     try:
         name = next(running)
@@ -131,7 +139,7 @@ def tick() -> float | None:
     if name:
         waiting.append(SHARE / f"{name}.ready")
         waiting[0].write_text("")
-    return 1.0
+    return timed(0.25)
 
 
 bpy.context.preferences.view.show_splash = False

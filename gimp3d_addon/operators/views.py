@@ -14,9 +14,9 @@ from mathutils import Matrix, Vector
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras
-from gimp3d.orbit import orbit_cameras
+from gimp3d.orbit import measured_up, orbit_cameras
 
-from .. import backdrops, bridge
+from .. import backdrops, bridge, splats
 from .base import ReportsErrors, current_boxes, current_splat, link
 
 COLLECTION = "3D-GIMP views"
@@ -95,6 +95,15 @@ class GIMP3D_OT_add_views(ReportsErrors, bpy.types.Operator):
     width: IntProperty(name="Width", default=960, min=16, max=8192, description="Of each view's picture, pixels")
     height: IntProperty(name="Height", default=540, min=16, max=8192, description="Of each view's picture, pixels")
     fov: FloatProperty(name="Field of view", default=50.0, min=5, max=120, description="Horizontal, degrees")
+    up: EnumProperty(
+        items=(
+            ("FLOOR", "From the Floor", "Away from the floor under the box, where one is found; else as Z"),
+            ("Z", "Z", "Blender's Z, for scenes that stand upright"),
+        ),
+        name="Up",
+        default="FLOOR",
+        description="What the rings of cameras stand round",
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -109,7 +118,9 @@ class GIMP3D_OT_add_views(ReportsErrors, bpy.types.Operator):
         context.view_layer.update()
         frame = bridge.splat_frame(splat)
         region = [bridge.box_from_blender(b, frame) for b in current_boxes(context)]
-        up = Matrix(frame.tolist()).to_3x3().inverted() @ Vector((0, 0, 1))  # Blender's up in the splat's frame
+        floor = measured_up(splats.read_object(splat).gaussians, region) if self.up == "FLOOR" else None
+        blenders = Matrix(frame.tolist()).to_3x3().inverted() @ Vector((0, 0, 1))  # in the splat's frame
+        up = blenders if floor is None else floor
         cameras = orbit_cameras(region, self.count, tuple(up), self.width, self.height, self.fov)
         add_cameras(context, cameras, splat)
 

@@ -111,6 +111,22 @@ def test_several_boxes_count_together_and_are_forgotten_one_by_one(splat: bpy.ty
     assert steps.splats_inside(splat, current_boxes(bpy.context)) == both
 
 
+@pytest.mark.parametrize(("up", "above"), [("FLOOR", (0, 0, 1)), ("Z", (0, -1, 0))])
+def test_an_orbit_stands_round_the_floor_or_round_z(splat: bpy.types.Object, up: str, above: tuple) -> None:
+    """The scene lies on its side: its floor's normal, the file's z, is not Blender's."""
+    splat.matrix_world = Matrix.Rotation(np.radians(-90), 4, "X")
+    bpy.context.view_layer.update()
+    bpy.ops.gimp3d.add_roi()
+    bpy.context.object.matrix_world = splat.matrix_world @ Matrix.LocRotScale(
+        Vector(REGION[0].center), None, Vector(REGION[0].size)
+    )
+    bpy.ops.gimp3d.add_views(count=9, up=up)
+    frame = bridge.splat_frame(splat)
+    centres = [c.centre - REGION[0].center for c, _ in bridge.views_of(bpy.context, frame)]
+    heights = np.array(centres) @ above / np.linalg.norm(centres, axis=1)
+    np.testing.assert_allclose(np.sort(heights), np.sort(np.sin(np.radians([15, 35, 60] * 3))), atol=0.02)
+
+
 def test_looking_through_the_views_one_after_the_other(splat: bpy.types.Object, tmp_path: Path) -> None:
     bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
     blender_scene = bpy.context.scene
