@@ -103,10 +103,10 @@ class GIMP3D_PT_display(Advanced, bpy.types.Panel):
             say(layout, "Solid view shows no colours:", "INFO")
         if view is not None:
             layout.row(align=True).prop(view.shading, "type", expand=True)
-        shown = splats.display(splat) if splat is not None else None
-        if shown is not None:
-            for name, text in (("As Points", "Points in Viewport"), ("Fraction", "Share of Splats")):
-                layout.prop(shown, f'["{splats.socket_of(name)}"]', text=text)
+        for name, text in zip(splats.DISPLAY, ("Points in Viewport", "Share of Splats")):
+            found = splats.display_input(splat, name) if splat is not None else None
+            if found is not None:
+                layout.prop(*found, text=text)
         layout.operator("gimp3d.update_colours")
         row = layout.row(align=True)
         row.operator("gimp3d.render_view")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -27,6 +27,7 @@ TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
 COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
 GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
+DISPLAY = ("As Points", "Fraction")  # inputs of the node group
 EXTENT = 3.0  # standard deviations drawn
 MANY = 200_000  # from here on splats are shown as points unless the user asks otherwise
 UP_AXES = {
@@ -92,7 +93,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     obj.matrix_world = matrix
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
-    modifier[socket_of("As Points")] = len(gaussians) > MANY
+    set_display(obj, "As Points", len(gaussians) > MANY)
     return obj
 
 
@@ -106,16 +107,30 @@ def create_like(source: bpy.types.Object, name: str, file: SplatFile) -> bpy.typ
         result.matrix_world = source.matrix_world.copy()
         return result
     result = create_object(name, file, source.matrix_world.copy())
-    shown, before = display(result), display(source)
-    if shown is not None and before is not None:
-        for socket in ("As Points", "Fraction"):
-            shown[socket_of(socket)] = before[socket_of(socket)]
+    for name in DISPLAY if display_input(source, "Fraction") else ():
+        struct, prop = display_input(source, name)
+        set_display(result, name, struct.path_resolve(prop))
     return result
 
 
-def display(obj: bpy.types.Object) -> bpy.types.Modifier | None:
-    """The modifier that shows the splats; its inputs are `socket_of("As Points")` and `socket_of("Fraction")`."""
-    return next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == node_group()), None)
+def display_input(obj: bpy.types.Object, name: str) -> tuple[Any, str] | None:
+    """Where a display input lies, as UILayout.prop takes it; None if the user removed the modifier."""
+    modifier = next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == node_group()), None)
+    if modifier is None:
+        return None
+    key = next(s.identifier for s in node_group().interface.items_tree if s.name == name)
+    if hasattr(modifier, "properties"):  # Blender ≥ 5.2
+        return getattr(modifier.properties.inputs, key), "value"
+    return modifier, f'["{key}"]'
+
+
+def set_display(obj: bpy.types.Object, name: str, value: bool | float) -> None:
+    struct, prop = display_input(obj, name)
+    if prop == "value":
+        struct.value = value
+    else:
+        struct[prop[2:-2]] = value
+    obj.update_tag()
 
 
 def show_colours_from(obj: bpy.types.Object, eye: np.ndarray) -> None:
@@ -280,7 +295,7 @@ def node_group() -> bpy.types.NodeTree:
     lottery.data_type = "FLOAT"
     chosen = node("FunctionNodeCompare")
     chosen.data_type, chosen.operation = "FLOAT", "LESS_EQUAL"
-    link(lottery.outputs[1], chosen.inputs["A"])
+    link(lottery.outputs["Value"], chosen.inputs["A"])
     link(source.outputs["Fraction"], chosen.inputs["B"])
 
     ball = node("GeometryNodeMeshIcoSphere")
@@ -319,11 +334,6 @@ def node_group() -> bpy.types.NodeTree:
     link(coloured.outputs["Geometry"], choice.inputs["True"])
     link(choice.outputs["Output"], target.inputs["Geometry"])
     return tree
-
-
-def socket_of(name: str) -> str:
-    """The modifier's key of an input of the node group."""
-    return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
 
 
 def _named(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:

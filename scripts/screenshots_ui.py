@@ -5,6 +5,7 @@ Started by scripts/screenshots.py, which takes the pictures; a step waits until 
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import time
@@ -43,9 +44,8 @@ def steps() -> Iterator[str]:
     with bpy.context.temp_override(**view):
         bpy.ops.gimp3d.import_ply(filepath=str(SHARE / "scene.ply"))
     bpy.context.scene.view_settings.view_transform = "Standard"
-    modifier = bpy.context.object.modifiers[0]
-    modifier[next(s.identifier for s in modifier.node_group.interface.items_tree if s.name == "As Points")] = True
-    bpy.context.object.update_tag()
+    splats = importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats")
+    splats.set_display(bpy.context.object, "As Points", True)
     frames = json.loads((SHARE / "transforms.json").read_text())["frames"]
     space.region_3d.view_matrix = Matrix(frames[0]["transform_matrix"]).inverted()
     yield ""

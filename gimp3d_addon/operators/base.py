@@ -89,7 +89,9 @@ class RunsChild:
         ended = self.worker.poll()
         context.workspace.status_text_set(f"3D-GIMP: {self.said(context)} (Esc cancels)")
         for area in context.window.screen.areas:
-            area.tag_redraw()
+            for region in area.regions:
+                if region.type == "UI":  # not the view itself: drawing it again takes long
+                    region.tag_redraw()
         if not (ended or self.worker.cancelled):
             return {"PASS_THROUGH"}
         self._stop(context)

@@ -14,6 +14,7 @@ import pytest
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.images import read_image
 from gimp3d.io.ply import read_ply, write_gaussians
+from gimp3d_addon import splats
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]
@@ -215,12 +216,9 @@ def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, impor
     render = blender_scene.render
     render.engine, render.resolution_x, render.resolution_y = "CYCLES", 32, 24
     blender_scene.cycles.samples, blender_scene.cycles.use_denoising = 4, False
-    modifier = splat.modifiers[0]
-    switch = next(s.identifier for s in modifier.node_group.interface.items_tree if s.name == "As Points")
     pictures = []
     for as_points in (False, True):
-        modifier[switch] = as_points
-        splat.update_tag()
+        splats.set_display(splat, "As Points", as_points)
         render.filepath = str(tmp_path / f"{as_points}.png")
         bpy.ops.render.render(write_still=True)
         pictures.append(read_image(render.filepath))

@@ -93,8 +93,7 @@ def test_the_share_of_splats_shown(import_scene, few_gaussians: Gaussians) -> No
     splat = import_scene(few_gaussians.take(np.arange(2000) % 50))
     shown = []
     for fraction in (0.0, 0.25, 1.0):
-        splats.display(splat)[splats.socket_of("Fraction")] = fraction
-        splat.update_tag()
+        splats.set_display(splat, "Fraction", fraction)
         instances = bpy.context.evaluated_depsgraph_get().object_instances
         shown.append(sum(i.is_instance for i in instances))
     assert shown[0] == 0 and 400 < shown[1] < 600 and shown[2] == 2000
@@ -102,11 +101,11 @@ def test_the_share_of_splats_shown(import_scene, few_gaussians: Gaussians) -> No
 
 def test_what_a_result_is_shown_as_is_what_its_source_was(import_scene, few_gaussians: Gaussians) -> None:
     source = import_scene(few_gaussians)
-    splats.display(source)[splats.socket_of("As Points")] = True
-    splats.display(source)[splats.socket_of("Fraction")] = 0.5
+    splats.set_display(source, "As Points", True)
+    splats.set_display(source, "Fraction", 0.5)
     copy = splats.create_like(source, "copy", splats.read_object(source))
-    assert splats.display(copy)[splats.socket_of("As Points")] is True
-    assert splats.display(copy)[splats.socket_of("Fraction")] == 0.5
+    found = [splats.display_input(copy, name) for name in splats.DISPLAY]
+    assert [struct.path_resolve(prop) for struct, prop in found] == [True, 0.5]
 
 
 def test_the_true_picture_is_the_cores(import_scene, tmp_path: Path) -> None:
