@@ -15,6 +15,7 @@ from ..properties import preferences
 from ..worker import Worker
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
+AGAIN = {"PASS_THROUGH"}  # another child follows
 TICK = 0.1  # s between two looks at the child's progress
 
 
@@ -49,8 +50,8 @@ class RunsChild:
         """Write what the child needs and start it."""
         raise NotImplementedError
 
-    def collect(self, context: bpy.types.Context) -> None:
-        """Take the result of a child that ended well."""
+    def collect(self, context: bpy.types.Context) -> Worker | None:
+        """Take the result of a child that ended; may start another one, and is then called again."""
         raise NotImplementedError
 
     def tidy(self) -> None:
@@ -66,8 +67,11 @@ class RunsChild:
             self.worker = self.start(context)
         except FAILURES as error:
             return self._failed(error)
-        self.worker.join()
-        return self._end(context)
+        answer = AGAIN
+        while answer == AGAIN:
+            self.worker.join()
+            answer = self._end(context)
+        return answer
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if bpy.app.background or RunsChild.running is not None:
@@ -76,8 +80,7 @@ class RunsChild:
             self.worker = self.start(context)
         except FAILURES as error:
             return self._failed(error)
-        RunsChild.running = self
-        self._timer = context.window_manager.event_timer_add(TICK, window=context.window)
+        self._go(context)
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -95,7 +98,10 @@ class RunsChild:
         if not (ended or self.worker.cancelled):
             return {"PASS_THROUGH"}
         self._stop(context)
-        return self._end(context)
+        answer = self._end(context)
+        if answer == AGAIN:
+            self._go(context)
+        return answer
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Blender ends the operator: another file is opened, or the window closes."""
@@ -106,6 +112,10 @@ class RunsChild:
     def said(self, context: bpy.types.Context) -> str:
         """The child's progress in words."""
         return self.worker.words(context.scene.gimp3d.pace)
+
+    def _go(self, context: bpy.types.Context) -> None:
+        RunsChild.running = self
+        self._timer = context.window_manager.event_timer_add(TICK, window=context.window)
 
     def _stop(self, context: bpy.types.Context) -> None:
         RunsChild.running = None
@@ -118,9 +128,12 @@ class RunsChild:
             self.report({"INFO"}, "cancelled; the scene is as it was")
             return {"CANCELLED"}
         try:
-            self.collect(context)
+            following = self.collect(context)
         except FAILURES as error:
             return self._failed(error)
+        if following is not None:
+            self.worker = following
+            return AGAIN
         self.tidy()
         return {"FINISHED"}
 

@@ -181,7 +181,9 @@ class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
 
 
 class RunsReference(RunsInPassing):
-    """Mixin: the mask first, then the picture of the reference view; `deliver` takes both files."""
+    """Mixin: a child for the mask, then one for the picture of the reference view; `deliver` takes both files."""
+
+    _drawing = False
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -194,13 +196,18 @@ class RunsReference(RunsInPassing):
         worker, self._stem = _look(context, camera, folder)
         return worker
 
-    def collect(self, context: bpy.types.Context) -> None:
+    def collect(self, context: bpy.types.Context) -> Worker | None:
         self.worker.result()
         folder = Path(self._folder.name)
-        camera = context.scene.objects[self._camera]
-        _draw(context, camera, folder).wait()  # one view: a second or two
+        camera = context.scene.objects.get(self._camera)
+        if camera is None:
+            raise BadInput(f"camera {self._camera} is no longer in the scene")
+        if not self._drawing:
+            self._drawing = True
+            return _draw(context, camera, folder)
         context.scene.gimp3d.reference = camera
         self.deliver(context, folder / f"{VIEW}.png", folder / "masks" / f"{self._stem}.png")
+        return None
 
     def deliver(self, context: bpy.types.Context, picture: Path, mask: Path) -> None:
         raise NotImplementedError

@@ -19,6 +19,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply
 from gimp3d_addon import jobs, splats
 from gimp3d_addon.operators.base import RunsChild, current_splat
+from gimp3d_addon.operators.reference import RunsReference
 from gimp3d_addon.operators.remove import SOURCE, GIMP3D_OT_remove_object, RunsRemoval
 from gimp3d_addon.worker import Worker
 
@@ -58,9 +59,15 @@ class Window:
         class Pressed(RunsRemoval):
             bl_label = GIMP3D_OT_remove_object.bl_label
             start = GIMP3D_OT_remove_object.start
-            report = lambda _, kind, text: self.reports.append((kind, text))  # noqa: E731
 
-        pressed = Pressed()
+        return self.press(Pressed, until, event)
+
+    def press(
+        self, operator: type[RunsChild], until: Callable[[RunsChild], bool] = lambda _: False, event: str = "ESC"
+    ) -> set[str]:
+        """The same for any operator that runs a child."""
+        pressed = operator()
+        pressed.report = lambda kind, text: self.reports.append((kind, text))
         pressed.worker = pressed.start(self)
         RunsChild.running, pressed._timer = pressed, "timer"
         longest = 0.0
@@ -171,6 +178,21 @@ def test_a_refused_run_is_not_offered_again(splat: bpy.types.Object) -> None:
     with pytest.raises(RuntimeError, match="unknown provider"):
         bpy.ops.gimp3d.remove_object()
     assert jobs.unfinished(bpy.context) is None
+
+
+def test_a_chain_of_children_runs_in_the_window(splat: bpy.types.Object) -> None:
+    """The reference is painted after two of them: the mask, then the picture."""
+    delivered: list[bool] = []
+
+    class Pressed(RunsReference):
+        bl_label = "Paint in Blender"
+
+        def deliver(self, context: object, picture: Path, mask: Path) -> None:
+            delivered.append(picture.is_file() and mask.is_file())
+
+    window = Window()
+    assert window.press(Pressed) == {"FINISHED"} and delivered == [True]
+    assert window.longest_tick < 0.5 and RunsChild.running is None
 
 
 def test_opening_another_file_ends_the_run(splat: bpy.types.Object) -> None:
