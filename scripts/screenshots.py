@@ -73,18 +73,22 @@ def session(tool: Path, root: Path, out: Path) -> None:
         while not finished.exists():
             if window.poll() is not None or time.monotonic() - start > PATIENCE:
                 sys.exit(f"screenshots: Blender ended or is stuck; see {share / 'blender.log'}")
-            for ready in share.glob("*.ready"):
+            for ready in share.glob("key-*.ready"):
+                run(*inside, "xdotool", "mousemove", "500", "600", "key", ready.stem.removeprefix("key-"))
+                ready.unlink()
+            for ready in share.glob("[0-9]*.ready"):
                 time.sleep(6)  # llvmpipe takes its time to draw
                 run(*inside, "import", "-window", "root", f"/share/{ready.stem}.png")
                 picture = cv2.imread(str(share / f"{ready.stem}.png"))
                 cv2.imwrite(str(out / f"{ready.stem}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
                 print(f"screenshots: {ready.stem}", flush=True)
                 ready.unlink()
-            time.sleep(0.5)
+            time.sleep(0.2)
     finally:
         for process in (window, screen):  # with what runs inside of the chroot
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
+    print("".join(line for line in (share / "blender.log").open() if line.startswith("screenshots:")), end="")
     if finished.read_text() != "well":
         sys.exit(f"screenshots: {finished.read_text()}")
 

@@ -45,6 +45,7 @@ class RunsChild:
 
     running: RunsChild | None = None  # the one that runs beside Blender now; two would fight for the processor
     worker: Worker
+    _shown = ""
 
     def start(self, context: bpy.types.Context) -> Worker:
         """Write what the child needs and start it."""
@@ -90,11 +91,14 @@ class RunsChild:
         elif event.type != "TIMER":
             return {"PASS_THROUGH"}
         ended = self.worker.poll()
-        context.workspace.status_text_set(f"3D-GIMP: {self.said(context)} (Esc cancels)")
-        for area in context.window.screen.areas:
-            for region in area.regions:
-                if region.type == "UI":  # not the view itself: drawing it again takes long
-                    region.tag_redraw()
+        said = self.said(context)
+        if said != self._shown:  # drawing takes time too
+            self._shown = said
+            context.workspace.status_text_set(f"3D-GIMP: {said} (Esc cancels)")
+            for area in context.window.screen.areas:
+                for region in area.regions:
+                    if region.type == "UI":  # the panel, not the view
+                        region.tag_redraw()
         if not (ended or self.worker.cancelled):
             return {"PASS_THROUGH"}
         self._stop(context)

@@ -17,7 +17,7 @@ from ..worker import Worker, child_command, own_python
 from .base import RunsChild, python_of
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "zstandard")
-SIZES = ("about 150 MB to download, 500 MB on disk", "with PyTorch about 350 MB to download, 1.3 GB on disk")
+SIZES = ("about 170 MB to download, 650 MB on disk", "about 400 MB to download, 1.5 GB on disk")
 TORCH_INDEX = "https://download.pytorch.org/whl/cpu"
 MAKE = """
 import json, subprocess, sys, venv
