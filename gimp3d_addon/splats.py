@@ -115,10 +115,11 @@ def create_like(source: bpy.types.Object, name: str, file: SplatFile) -> bpy.typ
 
 def display_input(obj: bpy.types.Object, name: str) -> tuple[Any, str] | None:
     """Where a display input lies, as UILayout.prop takes it; None if the user removed the modifier."""
-    modifier = next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == node_group()), None)
-    if modifier is None:
+    group = bpy.data.node_groups.get(GROUP)  # not made here: a panel that is being drawn must change nothing
+    modifier = next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == group), None)
+    if group is None or modifier is None:
         return None
-    key = next(s.identifier for s in node_group().interface.items_tree if s.name == name)
+    key = next(s.identifier for s in group.interface.items_tree if s.name == name)
     if hasattr(modifier, "properties"):  # Blender ≥ 5.2
         return getattr(modifier.properties.inputs, key), "value"
     return modifier, f'["{key}"]'

@@ -142,6 +142,14 @@ def test_a_view_that_cannot_be_used_is_named(splat: bpy.types.Object, tmp_path: 
     assert "orbit/002 is ortho" in " ".join(drawn())
 
 
+def test_drawing_changes_nothing(splat: bpy.types.Object) -> None:
+    """Blender forbids it, and says so in the user's face: here the user has removed what shows the splats."""
+    bpy.data.node_groups.remove(bpy.data.node_groups[0])
+    before = len(bpy.data.node_groups), len(bpy.data.materials)
+    assert "gimp3d.update_colours" in drawn()
+    assert (len(bpy.data.node_groups), len(bpy.data.materials)) == before
+
+
 def test_while_it_runs_there_is_a_bar_and_a_cancel_button(splat: bpy.types.Object) -> None:
     class Running(RunsChild):
         bl_label = "Remove Object"

@@ -76,6 +76,7 @@ def test_the_last_picture_given_counts(splat: bpy.types.Object, tmp_path: Path) 
     assert settings.reference_paint is None and settings.reference_image.endswith("ref.png")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("provider", properties.INPAINT)
 def test_every_provider_that_is_offered_exists(splat: bpy.types.Object, provider: str) -> None:
     bpy.context.scene.gimp3d.inpaint, bpy.context.scene.gimp3d.preset = provider, "draft"
