@@ -41,14 +41,13 @@ class RunsRemoval(RunsChild):
             raise
         result = bring_back(context, self.folder)
         jobs.close(self.folder)
-        settings, seconds = context.scene.gimp3d, summary["seconds_total"]
-        if self._told and not self.worker.compiled:
+        settings, seconds, counts = context.scene.gimp3d, summary["seconds_total"], summary["counts"]
+        if self._told and counts["added"] and not self.worker.compiled:
             settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever
         report = self.folder / "report" / "index.html"
         settings.last_report = str(report) if report.exists() else ""
         for warning in summary["warnings"]:
             self.report({"WARNING"}, warning)
-        counts = summary["counts"]
         settings.hole = f"{counts['hole_pixels']:,} pixels in {counts['views']} views"
         self.report(
             {"INFO"}, f"{result.name}: {counts['removed']:,} splats removed, {counts['added']:,} added "
