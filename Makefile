@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -37,7 +37,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics
+bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -59,6 +59,21 @@ bench-propagate: $(READY)
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)
 	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
+
+# scikit-image's photographs and other programs' fills come from an environment of their own
+OTHERS := build/others
+
+$(OTHERS)/.ready:
+	$(PYTHON) -m venv $(OTHERS)
+	$(OTHERS)/bin/python -m pip install --quiet 'numpy<2' scikit-image==0.26.0 imageio
+	$(OTHERS)/bin/python -m pip install --quiet PyPatchMatch==2.2.0 || echo "PyPatchMatch cannot be installed here; it is left out"
+	@touch $@
+
+bench-nnf: $(READY) $(OTHERS)/.ready
+	$(BIN)/python scripts/bench_nnf.py --others $(OTHERS)/bin/python
+
+bench-inpaint: $(READY) $(OTHERS)/.ready
+	$(BIN)/python scripts/bench_inpaint.py --others $(OTHERS)/bin/python
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

@@ -25,7 +25,7 @@ VIEWS = (
     ("COLLECTION", "Collection", "The cameras in one collection are the views"),
     ("ANIMATED", "Animated camera", "Every frame of the active camera is a view"),
 )
-INPAINT = ("exemplar", "shiftmap", "telea", "ns")
+INPAINT = ("exemplar", "shiftmap", "fsr", "telea", "ns")
 SURFACES = ("auto", "harmonic", "planar")
 
 
@@ -75,7 +75,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     inpaint: StringProperty(
         name="Fill",
         default="exemplar",
-        description="What invents the part that no view shows: one of the list, or file:PATH, or command:CMD",
+        description="What invents the part that no view shows: one of the list, or file:PATH, onnx:PATH or command:CMD",
         search=lambda _, context, text: INPAINT,
         search_options={"SUGGESTION"},
     )

@@ -83,7 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--inpaint",
         default="exemplar",
         metavar="PROVIDER",
-        help="exemplar|telea|ns|shiftmap|file:PATH|command:CMD",
+        help="exemplar|telea|ns|shiftmap|fsr|file:PATH|onnx:PATH[,WxH]|command:CMD",
     )
     remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
     remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")

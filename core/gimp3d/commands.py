@@ -355,6 +355,7 @@ def _summary(
             "gaussians_out": len(file.gaussians) - removed + added,
             "views": result.views,
             "hole_pixels": result.hole_pixels,
+            "open_pixels": result.open_pixels,
         },
         "selection": result.selection,
         "references": [asdict(choice) for choice in result.references],
@@ -383,6 +384,12 @@ def _job_key(job: RemovalJob, views: Sequence[View], extra: Mapping[str, np.ndar
     digest.update(json.dumps(settings, sort_keys=True).encode())
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
+            digest.update(Path(path).read_bytes())
+    for provider in (job.inpaint, job.depth_prior):
+        path = provider.partition(":")[2]
+        while path and not Path(path).is_file():  # options follow a file's name after commas
+            path = path.rpartition(",")[0]
+        if path:
             digest.update(Path(path).read_bytes())
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())

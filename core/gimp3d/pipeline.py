@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import cv2
 import numpy as np
 
 from .box import Region
@@ -20,6 +21,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.exposure import level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -47,6 +49,7 @@ from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
 R = TypeVar("R")
+NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
 @dataclass(frozen=True)
@@ -63,18 +66,19 @@ class RemovalSettings:
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
     use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
-    extra_references: int = 2  # views completed after the first one, where it does not reach
-    extra_gain: float = 0.02  # share of the hole that an extra reference must still find open
+    extra_references: int = 3  # views completed after the first one, where it does not reach
+    extra_gain: float = 0.01  # share of the hole that an extra reference must still find open
     random_seed: int = 0
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(extra_references=0),
+    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
     "balanced": RemovalSettings(),
     "best": RemovalSettings(extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         use_evidence=False,
@@ -102,7 +106,7 @@ class Picture:
     image: np.ndarray  # [H, W, 3] uint8, the view
     data: tuple[
         np.ndarray, ...
-    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules)
+    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,7 @@ class RemovalResult:
     added: Gaussians | None
     stages: tuple[StageReport, ...] = ()
     hole_pixels: int = 0
+    open_pixels: int = 0  # of these, what no reference reached
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
@@ -208,14 +213,17 @@ def remove_object(
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
+    drawn = {v.camera.id: render_bytes(kept, v.camera) for v in masks.views}
+    exposures = {v.camera.id: level_exposure(v, photos[v.camera.id], drawn[v.camera.id]) for v in masks.views}
+    levelled = {name: e.image for name, e in exposures.items()}
     painted = {
-        v.camera.id: np.where(v.silhouette[..., None], render_bytes(kept, v.camera), photos[v.camera.id])
-        for v in masks.views
+        v.camera.id: np.where(v.silhouette[..., None], drawn[v.camera.id], levelled[v.camera.id]) for v in masks.views
     }
+    del drawn
     filled, added = kept, None
     open_views = masks.views
     for round_ in range(1 + settings.extra_references):
-        if round_ and _open_share(open_views, masks) < settings.extra_gain:
+        if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
         try:
@@ -224,26 +232,33 @@ def remove_object(
                 "" if first else f" {round_ + 1}",
                 filled,
                 open_views,
-                photos,
+                levelled,
                 painted,
                 settings,
                 reference if first else None,
                 reference_image if first else None,
             )
         except IllPosed as error:
-            if first:
+            touched = sum(int(v.silhouette.sum()) for v in masks.views)
+            if first and masks.hole_pixels > NEGLIGIBLE * touched:
                 raise
-            run.warnings.append(f"no further reference view helps: {error}")
+            run.warnings.append(f"no {'' if first else 'further '}reference view helps: {error}")
             break
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
-        open_views = _all_still_open(open_views, filled, len(added), rules)
-    left = _open_share(open_views, masks)
-    if left > settings.extra_gain:
-        run.warnings.append(f"{left:.0%} of the hole's pixels are reached by no reference view and stay open")
-    return _finish(run, keep, added, masks, painted, [])
+        painted = _redrawn(painted, filled, masks.views, open_views)
+        open_views = _all_still_open(open_views, filled, len(added), rules, settings.masks)
+    left = _open_pixels(open_views)
+    if left > settings.extra_gain * masks.hole_pixels:
+        share = left / masks.hole_pixels
+        run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
+    painted = {
+        name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
+        for name, v in ((v.camera.id, v) for v in masks.views)
+    }
+    return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
 def _fill_from_one_view(
@@ -251,7 +266,7 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
-    photos: dict[str, np.ndarray],  # with the object
+    photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
     wanted: str | None,
@@ -299,6 +314,8 @@ def _fill_from_one_view(
             ),
             settings.mapping,
             settings.random_seed,
+            view.camera,
+            depth,
         ),
     )
     reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
@@ -317,7 +334,7 @@ def _fill_from_one_view(
                 "rules",
                 f"Filled view {p.camera_id}",
                 p.pasted(painted[p.camera_id]),
-                (p.rule_map(*painted[p.camera_id].shape[:2]),),
+                (p.rule_map(*painted[p.camera_id].shape[:2]), p.pasted(painted[p.camera_id], p.raw)),
             )
             for p in _spread(painting.views)
         ),
@@ -406,32 +423,54 @@ def _appearance(
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
-    filled = inpaint_reference(settings.inpaint, base, view.target & ~seen, settings.random_seed)
+    hole = view.target & ~seen
+    filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
+def _redrawn(
+    painted: dict[str, np.ndarray], filled: Gaussians, first: Sequence[ViewMasks], open_views: Sequence[ViewMasks]
+) -> dict[str, np.ndarray]:
+    """The painted views, with the filled scene where the removal left a gap that was never to be filled.
+
+    Beside what is in front, its soft edge is no target, but the emptied scene shows through it.
+    """
+
+    def redraw(before: ViewMasks, now: ViewMasks) -> np.ndarray:
+        picture = painted[now.camera.id]
+        gap = before.silhouette & ~before.target & (before.alpha_after < 0.99)
+        return np.where(gap[..., None], render_bytes(filled, now.camera), picture) if gap.any() else picture
+
+    return dict(zip(painted, parallel_map(lambda pair: redraw(*pair), zip(first, open_views))))
+
+
 def _all_still_open(
-    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray]
+    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray], masks: MaskSettings
 ) -> tuple[ViewMasks, ...]:
-    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id]), views))
+    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id], masks), views))
 
 
-def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray) -> ViewMasks:
+def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray, masks: MaskSettings) -> ViewMasks:
     """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
 
     A pixel that a splat's edge covers but that got no colour stays open, or the next fill would continue its old one.
+    What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is
+    in front, where a splat's soft edge has the depth of neither.
     """
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
-    depth_after, alpha_after = surface_depth(filled, view.camera)
-    return replace(
-        view,
-        target=view.target & (~covered | (rules == Rule.UNREACHED)),
-        depth_after=depth_after,
-        alpha_after=alpha_after,
-    )
+    depth, alpha = surface_depth(filled, view.camera)
+    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > masks.solid)
+    target = view.target & (~covered | (rules == Rule.UNREACHED))
+    side = 2 * masks.margin + 1
+    farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))
+    nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
+    at_edge = nearest < (1 - masks.layer_step) * depth
+    joined = coloured & (alpha > masks.solid) & (at_edge | (depth < (1 + masks.layer_step) * farthest))
+    wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side - 1, side - 1), np.uint8)) > 0
+    return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
 
 
 def _spread(items: Sequence[R], count: int = 3) -> list[R]:
@@ -439,8 +478,8 @@ def _spread(items: Sequence[R], count: int = 3) -> list[R]:
     return [items[k * len(items) // count] for k in range(min(count, len(items)))]
 
 
-def _open_share(open_views: Sequence[ViewMasks], masks: Masks) -> float:
-    return sum(int(v.target.sum()) for v in open_views) / max(1, masks.hole_pixels)
+def _open_pixels(open_views: Sequence[ViewMasks]) -> int:
+    return sum(int(v.target.sum()) for v in open_views)
 
 
 def render_bytes(

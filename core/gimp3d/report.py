@@ -26,6 +26,7 @@ RULE_COLOURS = {
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
+MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
@@ -38,6 +39,7 @@ figure{margin:0}figure img{width:100%;border-radius:6px;display:block}
 figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}
 .flip:hover img+img{opacity:1}
+.book{max-width:720px}.book input{width:100%}
 .bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
 .warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
 .dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
@@ -57,12 +59,17 @@ def write_removal_report(
         write_png(folder / names[0], render_bytes(scene, view.camera))
         write_png(folder / names[1], render_bytes(after, view.camera))
         pairs.append((view.camera.id, *names))
+    painted = list(result.painted.items())
+    flips = []
+    for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
+        flips.append((camera_id, f"view_{k:02d}.png"))
+        write_png(folder / flips[-1][1], image)
     stage_pictures = []
     for k, picture in enumerate(result.pictures):
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
         stage_pictures.append((picture.title, name))
-    page = _page(summary, pairs, stage_pictures, result.references)
+    page = _page(summary, pairs, flips, stage_pictures, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
 
@@ -81,7 +88,7 @@ def draw(picture: Picture) -> np.ndarray:
         marked = picture.image
         for rule, (_, colour) in RULE_COLOURS.items():
             marked = tinted(marked, picture.data[0] == rule, colour, 0.35)
-        return np.hstack([picture.image, marked])
+        return np.hstack([picture.data[1], picture.image, marked])
     return outlined(picture.image, picture.data[0])
 
 
@@ -167,6 +174,7 @@ def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.
 def _page(
     summary: dict[str, Any],
     pairs: Sequence[tuple[str, str, str]],
+    flips: Sequence[tuple[str, str]],
     pictures: Sequence[tuple[str, str]],
     choices: Sequence[ReferenceChoice],
 ) -> str:
@@ -202,12 +210,28 @@ def _page(
         f"<p>{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
         f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>{warnings}"
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
+        f"{_flip_book(flips)}"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
         f"{_references(choices)}"
-        f"<h2>What each stage saw</h2><p>{legend}</p><div class=grid>{stages}</div>"
+        f"<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. {legend}</p>"
+        f"<div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
     )
+
+
+def _flip_book(flips: Sequence[tuple[str, str]]) -> str:
+    """The painted views one after the other, under a slider."""
+    if not flips:
+        return ""
+    figures = "".join(
+        f"<figure{' hidden' if k else ''}><img src='{picture}' alt=''>"
+        f"<figcaption>{html.escape(name)}</figcaption></figure>"
+        for k, (name, picture) in enumerate(flips)
+    )
+    turn = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k != value)"
+    slider = f"<input type=range min=0 max={len(flips) - 1} value=0 aria-label=view oninput='{turn}'>"
+    return f"<h2>Painted views</h2><div class=book>{slider}<div>{figures}</div></div>"
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:

@@ -15,6 +15,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply
 from gimp3d.pipeline import render_bytes
+from gimp3d.priors.inpaint import PROVIDERS
 from gimp3d_addon import properties
 
 GREEN = (20, 200, 40)
@@ -74,6 +75,10 @@ def test_the_last_picture_given_counts(splat: bpy.types.Object, tmp_path: Path) 
     bpy.ops.gimp3d.load_reference(filepath=str(tmp_path / "ref.png"))
     settings = bpy.context.scene.gimp3d
     assert settings.reference_paint is None and settings.reference_image.endswith("ref.png")
+
+
+def test_the_providers_that_are_offered_are_those_that_there_are() -> None:
+    assert set(properties.INPAINT) == set(PROVIDERS)
 
 
 @pytest.mark.slow

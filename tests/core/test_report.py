@@ -41,6 +41,10 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
     assert "<script" not in page and "&lt;script&gt;" in page and "&lt;b&gt;" in page and "file:&lt;x&gt;" in page
     choice = result.references[0]
     assert f"<b>{choice.camera_id}" in page and f"{choice.scores[0].score:.2f}" in page
+    book = re.findall(r"<figure( hidden)?><img src='(view_\d+\.png)'", page)
+    assert [hidden for hidden, _ in book] == ["", *[" hidden"] * (len(result.painted) - 1)]
+    for (_, name), painted in zip(book, result.painted.values(), strict=True):
+        np.testing.assert_array_equal(read_image(tmp_path / name), painted)
     assert not re.search(r"(src|href)='(https?:|//)", page)
 
 
@@ -53,14 +57,14 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
         Picture("appearance", "", IMAGE, (HERE,)),
         Picture("mapping", "", IMAGE, (np.where(HERE, 3, -1), np.where(HERE, 4, -1))),
         Picture("mapping", "", IMAGE, (np.full((20, 30), -1), np.full((20, 30), -1))),
-        Picture("rules", "", IMAGE, (np.where(HERE, Rule.OWN_PIXELS, Rule.UNTOUCHED),)),
+        Picture("rules", "", IMAGE, (np.where(HERE, Rule.OWN_PIXELS, Rule.UNTOUCHED), IMAGE)),
     ],
 )
 def test_every_kind_of_picture_is_drawn(picture: Picture) -> None:
     drawn = draw(picture)
     assert drawn.dtype == np.uint8 and drawn.shape[0] == 20 and drawn.shape[2] == 3
     if picture.data[0].any() and picture.kind != "depth":
-        assert (drawn[:, :30] != IMAGE).any() or (drawn[:, 30:] != IMAGE).any()
+        assert (drawn[:, :30] != IMAGE).any() or (drawn[:, -30:] != IMAGE).any()
 
 
 @pytest.mark.parametrize("scale", [0.4, 3.0, 0.0])

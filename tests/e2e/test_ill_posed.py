@@ -121,7 +121,7 @@ ELSEWHERE = {
     },
     BLIND_REFERENCE: {"core/stages/test_reference.py": ["test_a_wanted_view_is_taken_unless_it_does_not_see_the_hole"]},
     FEW_DIRECTIONS: {
-        "core/solvers/test_harmonics.py": ["test_ill_posed_directions_stay_bounded"],
+        "core/solvers/test_harmonics.py": ["test_ill_posed_observations_leave_the_reference_colour_alone"],
         "core/stages/test_seed.py": ["test_one_view_gives_sh_degree_zero"],
     },
     BAD_ROWS: {
@@ -377,7 +377,7 @@ def floor_with_a_frame(inner: float = 0.3, outer: float = 0.55, height: float = 
 
 @row(
     TINY,
-    missing("T of a few pixels", "masks: opening T by 3×3 drops every part thinner than 3 px; such holes stay open"),
+    "T of a few pixels",
     "an image of 12×9 pixels",
     "a patch larger than the image",
 )
@@ -444,7 +444,11 @@ def test_a_useless_prior_is_not_used_and_that_is_said(case: str, remove: Remove,
     kind = "true" if case == "of another view" else case
     np.save(tmp_path / "prior.npy", prior_of(kind, reference).astype(np.float32))
     options = ("--reference", reference.id, "--depth-prior", f"file:{tmp_path / 'prior.npy'}")
-    done = remove(options=options)
+    views = list(cameras())
+    if case == "of another view":  # the first reference shows half of the hole, so that there is a second one
+        views[1] = reference = replace(reference, cx=reference.cx - 60)
+        np.save(tmp_path / "prior.npy", prior_of(kind, reference).astype(np.float32))
+    done = remove(views=views, options=options)
     depth = done.stage("depth")
     if case == "of another view":
         assert depth["reason"].startswith("guided")
@@ -459,9 +463,7 @@ def test_a_useless_prior_is_not_used_and_that_is_said(case: str, remove: Remove,
 @row(
     BAD_DEPTH,
     "the floor ends beside the object",
-    missing(
-        "a sky of splats", "masks: giant splats of the sky that the hole reveals go; T opens at the floor's far edge"
-    ),
+    "a sky of splats",
 )
 def test_the_far_and_the_void_are_no_surface(case: str, remove: Remove) -> None:
     if case == "the floor ends beside the object":
@@ -478,10 +480,7 @@ def test_the_far_and_the_void_are_no_surface(case: str, remove: Remove) -> None:
     assert_filled(done, true, psnr=34)  # a fringe of a pixel at the floor's edge takes the void's colour
 
 
-IN_FRONT = "masks: T takes in parts of thin things in front of the object"
-
-
-@row(JUMP, missing("a rod before the hole is not filled", IN_FRONT), missing("nor painted elsewhere", IN_FRONT))
+@row(JUMP, "a rod before the hole is not filled", "nor painted elsewhere")
 def test_what_stands_before_the_hole_stays_alone(case: str, remove: Remove) -> None:
     points = np.stack([np.full(60, 0.55), np.zeros(60), np.linspace(0, 1.2, 60)], -1)
     rod = discs(points, (1, 0, 0), np.tile([0.1, 0.2, 0.9], (60, 1)), 0.03)
@@ -642,17 +641,18 @@ def test_lenses_are_exact_or_refused_by_name(case: str, remove: Remove) -> None:
 
 @row(
     EXPOSURE,
-    missing("photos 20 % brighter or darker than the splats", "seed: no gain from the photos to the splats' exposure"),
+    "photos 20 % brighter or darker than the splats",
 )
 def test_the_fill_has_the_exposure_of_what_is_round_it(case: str, remove: Remove) -> None:
     gains = {c.id: 1 + 0.2 * np.sin(2.1 * k) for k, c in enumerate(cameras())}
     done = remove(photo=lambda c: np.clip(gains[c.id] * render_bytes(scene(), c), 0, 255).astype(np.uint8))
+    even = remove(photo=lambda c: render_bytes(scene(), c), folder="even").after.gaussians
     result = done.after.gaussians
     chosen = np.arange(len(result)) >= len(result) - done.summary["counts"]["added"]
     for camera in cameras(4):
         new = footprint(result, camera, chosen) > 0.9
-        mean = render_bytes(result, camera)[new].mean() / render_bytes(truth(), camera)[new].mean()
-        assert abs(mean - 1) < 0.04, camera.id
+        mean = render_bytes(result, camera)[new].mean() / render_bytes(even, camera)[new].mean()
+        assert abs(mean - 1) < 0.02, camera.id
 
 
 def with_shadow() -> Gaussians:
@@ -665,9 +665,11 @@ def with_shadow() -> Gaussians:
 
 @row(
     SHADOW,
-    missing("an extra ROI", "evidence: photos show the floor that the flat box holds, so its shadow is copied back"),
+    "an extra ROI",
     "an extra mask",
-    missing("reported", "nothing looks for what the object leaves outside the region"),
+    missing(
+        "reported", "colours round the hole do not tell a shadow from a dark tile or mat; nothing else is looked at"
+    ),
 )
 def test_shadows_can_be_named_and_go(case: str, remove: Remove) -> None:
     dark = np.flatnonzero((with_shadow().sh[:, 0] != scene().sh[:, 0]).any(1))

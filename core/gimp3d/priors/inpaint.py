@@ -1,16 +1,17 @@
 """Providers of appearance: what the reference looks like without the object (METHOD section 2).
 
-A provider is a function (image, hole, seed) → Appearance. To add one: write it and name it in PROVIDERS or,
-if it takes an argument after a colon, in `_provider`.
+A provider is a function Unfinished → Appearance. To add one: write it and name it in PROVIDERS or, if it takes an
+argument after a colon, in PROVIDERS_OF (docs/developing.md).
 """
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,9 @@ import numpy as np
 from ..errors import BadInput, IllPosed
 from ..io.images import read_image, write_png
 from ..solvers.exemplar import ExemplarSettings, complete_picture
+from ..solvers.patchmatch import nearest_allowed
+from ..solvers.surface import tangent_planes
+from .onnx import read_model
 
 SURROUNDINGS = 1.0  # margin round the hole's bounding box that textures are taken from, in its side lengths
 LEAST_SURROUNDINGS = 32  # px, at least
@@ -35,6 +39,8 @@ MAX_GAIN = 2.0
 # 0.99, photos from a few steps aside 12 to 30 and 0.1 to 0.85, other scenes over 30 and under 0.4.
 FOREIGN_DIFFERENCE = 12.0
 FOREIGN_CORRELATION = 0.8
+FREE_SIZE = (512, 512)  # (height, width) for models that take any size
+BRIGHTEST = 2.0  # answers up to here are in [0, 1], give or take what networks overshoot
 CONFIDENCE_SCALE = 20.0  # grey levels of residual at which the confidence has fallen to 1/e
 
 
@@ -47,7 +53,18 @@ class Appearance:
     reason: str
 
 
-Provider = Callable[[np.ndarray, np.ndarray, int], Appearance]
+@dataclass(frozen=True)
+class Unfinished:
+    """What a provider is given. It may return anything inside the hole; what it returns outside is ignored."""
+
+    image: np.ndarray  # [H, W, 3] uint8; what stands in the hole means nothing
+    hole: np.ndarray  # [H, W] bool, not empty
+    seed: int = 0  # the same seed gives the same fill
+    disparity: np.ndarray | None = None  # [H, W] float32, 1/z of the surface, in the hole too; 0 = infinity or nothing
+    K: np.ndarray | None = None  # [3, 3], known with the disparity
+
+
+Provider = Callable[[Unfinished], Appearance]
 
 
 def inpaint_reference(
@@ -55,8 +72,12 @@ def inpaint_reference(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool
     seed: int = 0,
+    disparity: np.ndarray | None = None,  # [H, W] float32, of the completed surface; None: not known
+    K: np.ndarray | None = None,  # [3, 3]
 ) -> Appearance:
     """Fill the hole by the provider that `spec` names (CONTRACT: Providers).
+
+    The surface guides `exemplar`: textures are copied along it, so that they shrink with distance.
 
     Raises
     ------
@@ -70,52 +91,50 @@ def inpaint_reference(
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
     if hole.all() and not spec.startswith("file:"):
         raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
-    filled = provider(image, hole, seed)
+    filled = provider(Unfinished(image, hole, seed, disparity, K))
     return Appearance(np.where(hole[..., None], filled.image, image), filled.confidence, filled.reason)
 
 
 def _provider(spec: str) -> Provider:
     name, _, argument = spec.partition(":")
     if spec in PROVIDERS:
-        return lambda image, hole, seed: _without_specks(PROVIDERS[spec], image, hole, seed)
-    if name == "file" and argument:
-        return lambda image, hole, seed: paste_picture(image, hole, read_image(argument), argument)
-    if name == "command" and argument:
-        return lambda image, hole, seed: _run_command(argument, image, hole)
-    choices = f"{', '.join(PROVIDERS)}, file:PATH or command:CMD"
-    if name == "onnx":
-        raise BadInput(f"--inpaint {spec}: model files are not in this version; use {choices}")
-    raise BadInput(f"--inpaint: unknown provider {spec!r}; use {choices}")
+        return lambda view: _without_specks(PROVIDERS[spec], view)
+    if name in PROVIDERS_OF and argument:
+        return lambda view: PROVIDERS_OF[name](argument, view)
+    choices = ", ".join([*PROVIDERS, "file:PATH", "onnx:PATH"])
+    raise BadInput(f"--inpaint: unknown provider {spec!r}; use {choices} or command:CMD")
 
 
-def _without_specks(provider: Provider, image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+def _without_specks(provider: Provider, view: Unfinished) -> Appearance:
     """Parts of the hole of a few pixels are interpolated; the provider fills the rest."""
+    image, hole = view.image, view.hole
     _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     specks = hole & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
     if specks.any():
         rest = hole & ~specks
-        image = np.where(specks[..., None], telea(image, hole, seed).image, image)
+        image = np.where(specks[..., None], telea(view).image, image)
         if not rest.any():
             return Appearance(image, 1.0, "a hole of a few pixels: interpolated")
         hole = rest
-    return provider(image, hole, seed)
+    return provider(replace(view, image=image, hole=hole))
 
 
-def exemplar(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+def exemplar(view: Unfinished) -> Appearance:
     """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
-    near = _surroundings(hole)
-    done = complete_picture(image[near], hole[near], ExemplarSettings(seed=seed))
+    near = _surroundings(view.hole)
+    surface = None
+    if view.disparity is not None and view.K is not None:
+        corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])
+        surface = tangent_planes(view.disparity[near], view.K - corner)
+    done = complete_picture(view.image[near], view.hole[near], ExemplarSettings(seed=view.seed), surface)
     if np.isnan(done.misfit):
-        smooth = telea(image, hole, seed).image
-        return Appearance(smooth, 0.1, "no patch of the reference lies off the hole: interpolated")
+        return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
-    whole = image.copy()
+    whole = view.image.copy()
     whole[near] = done.image
-    return Appearance(
-        whole,
-        confidence,
-        f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels",
-    )
+    how = "" if surface is None else ", laid along its surfaces"
+    words = f"filled with the view's own texture{how}, which fits to {done.misfit:.1f} grey levels"
+    return Appearance(whole, confidence, words)
 
 
 def _surroundings(hole: np.ndarray) -> tuple[slice, slice]:
@@ -129,36 +148,45 @@ def _surroundings(hole: np.ndarray) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def telea(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+def telea(view: Unfinished) -> Appearance:
     """Fast marching (Telea 2004), OpenCV."""
-    return Appearance(cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA), 0.3, "interpolated by telea")
+    return _interpolated(view, "telea", cv2.INPAINT_TELEA)
 
 
-def navier_stokes(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
+def navier_stokes(view: Unfinished) -> Appearance:
     """Isophotes continued (Bertalmio 2001), OpenCV."""
-    return Appearance(cv2.inpaint(image, hole.astype(np.uint8), 3, cv2.INPAINT_NS), 0.3, "interpolated by ns")
+    return _interpolated(view, "ns", cv2.INPAINT_NS)
 
 
-def shiftmap(image: np.ndarray, hole: np.ndarray, seed: int) -> Appearance:
-    """Shift maps (Pritch 2009), OpenCV's xphoto: it compares Lab colours; its mask marks what is known."""
+def _interpolated(view: Unfinished, name: str, method: int) -> Appearance:
+    """By cv2.inpaint, which looks at a few pixels of the hole at the image's border: they hold the nearest colour."""
+    rows, cols = nearest_allowed(~view.hole)
+    filled = cv2.inpaint(view.image[rows, cols], view.hole.astype(np.uint8), 3, method)
+    return Appearance(filled, 0.3, f"interpolated by {name}")
+
+
+def shiftmap(view: Unfinished) -> Appearance:
+    """Shift maps (Pritch 2009), OpenCV's xphoto, which compares Lab colours."""
+    return _xphoto(view, "shiftmap", "INPAINT_SHIFTMAP", cv2.COLOR_RGB2Lab, cv2.COLOR_Lab2RGB)
+
+
+def fsr(view: Unfinished) -> Appearance:
+    """Frequency-selective reconstruction (Genser 2018), OpenCV's xphoto, the fast one."""
+    return _xphoto(view, "fsr", "INPAINT_FSR_FAST", cv2.COLOR_RGB2BGR, cv2.COLOR_BGR2RGB)
+
+
+def _xphoto(view: Unfinished, name: str, method: str, there: int, back: int) -> Appearance:
+    """One of xphoto's methods; their mask marks what is known."""
     if not hasattr(cv2, "xphoto"):
-        raise BadInput("--inpaint shiftmap needs OpenCV's contrib modules (opencv-contrib-python-headless)")
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2Lab)
-    filled = np.zeros_like(lab)
-    cv2.setRNGSeed(seed)
-    cv2.xphoto.inpaint(lab, (~hole).astype(np.uint8) * 255, filled, cv2.xphoto.INPAINT_SHIFTMAP)
-    return Appearance(cv2.cvtColor(filled, cv2.COLOR_Lab2RGB), 0.5, "filled by shiftmap")
+        raise BadInput(f"--inpaint {name} needs OpenCV's contrib modules (opencv-contrib-python-headless)")
+    colours = cv2.cvtColor(view.image, there)
+    filled = np.zeros_like(colours)
+    cv2.setRNGSeed(view.seed)
+    cv2.xphoto.inpaint(colours, (~view.hole).astype(np.uint8) * 255, filled, getattr(cv2.xphoto, method))
+    return Appearance(cv2.cvtColor(filled, back), 0.5, f"filled by {name}")
 
 
-PROVIDERS: dict[str, Provider] = {
-    "exemplar": exemplar,
-    "telea": telea,
-    "ns": navier_stokes,
-    "shiftmap": shiftmap,
-}
-
-
-def _run_command(command: str, image: np.ndarray, hole: np.ndarray) -> Appearance:
+def run_command(command: str, view: Unfinished) -> Appearance:
     """What a program makes of {image} and {mask} (255 = fill) in {out}; no shell is involved."""
     if "{out}" not in command:
         raise BadInput(
@@ -170,8 +198,8 @@ def _run_command(command: str, image: np.ndarray, hole: np.ndarray) -> Appearanc
         raise BadInput(f"--inpaint command: cannot read {command!r} ({error})") from None
     with tempfile.TemporaryDirectory(prefix="gimp3d-") as folder:
         paths = {name: Path(folder) / f"{name}.png" for name in ("image", "mask", "out")}
-        write_png(paths["image"], image)
-        write_png(paths["mask"], hole)
+        write_png(paths["image"], view.image)
+        write_png(paths["mask"], view.hole)
         for name, path in paths.items():
             words = [word.replace(f"{{{name}}}", str(path)) for word in words]
         try:
@@ -183,7 +211,50 @@ def _run_command(command: str, image: np.ndarray, hole: np.ndarray) -> Appearanc
             raise BadInput(f"--inpaint command: {words[0]} ended with {done.returncode}: {said[0][:200]}")
         if not paths["out"].exists():
             raise BadInput(f"--inpaint command: {words[0]} wrote no {{out}} picture")
-        return paste_picture(image, hole, read_image(paths["out"]), f"the picture that {words[0]} wrote")
+        return paste_picture(view.image, view.hole, read_image(paths["out"]), f"the picture that {words[0]} wrote")
+
+
+def run_model(argument: str, view: Unfinished) -> Appearance:
+    """What a network makes of the hole's surroundings: PATH[,WIDTHxHEIGHT] of an ONNX file, run by OpenCV.
+
+    It takes a picture of 3 channels and a mask of 1 (LaMa), or both as 4 channels: RGB in [0, 1] with the hole black,
+    1 = fill; it answers with RGB in [0, 1] or [0, 255]. What it leaves outside the hole must be the view.
+    """
+    size = re.search(r",(\d+)x(\d+)$", argument)
+    path = Path(argument[: size.start()] if size else argument)
+    model = read_model("--inpaint onnx", path)
+    channels = {dims[1]: name for name, dims in model.inputs.items() if len(dims) == 4}
+    if sorted(channels) not in ([1, 3], [4]):
+        takes = ", ".join(f"{name} {'×'.join(map(str, dims))}" for name, dims in model.inputs.items())
+        raise BadInput(
+            f"--inpaint onnx: {path} takes {takes}; it must take a picture of 3 channels and a mask of 1, or 4 channels"
+        )
+    declared = model.inputs[channels[max(channels)]][2:]
+    height, width = declared if all(declared) else (int(size[2]), int(size[1])) if size else FREE_SIZE
+    near = _surroundings(view.hole)
+    hole = cv2.resize(view.hole[near].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
+    picture = _scaled(view.image[near], width, height).astype(np.float32) / 255 * ~hole[..., None]
+    parts = {3: picture, 1: hole[..., None], 4: np.dstack([picture, hole])}
+    outputs = model.run({name: parts[n].transpose(2, 0, 1)[None] for n, name in channels.items()})
+    answer = np.squeeze(outputs[0])
+    if answer.ndim != 3 or answer.shape[0] != 3 or not np.isfinite(answer).all():
+        raise BadInput(
+            f"--inpaint onnx: {path} answers with {'×'.join(map(str, outputs[0].shape))}, which is no finite picture"
+        )
+    if answer.max() <= BRIGHTEST:
+        answer = answer * 255
+    painted = np.clip(np.rint(answer), 0, 255).astype(np.uint8).transpose(1, 2, 0)
+    h, w = view.hole[near].shape
+    name = f"the picture that {path} painted"
+    done = paste_picture(view.image[near], view.hole[near], _scaled(painted, w, h), name)
+    whole = view.image.copy()
+    whole[near] = done.image
+    return replace(done, image=whole)
+
+
+def _scaled(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    smaller = width * height < picture.shape[0] * picture.shape[1]
+    return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
 def paste_picture(
@@ -226,7 +297,7 @@ def _resized(picture: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarr
         raise BadInput(f"{name} has {width}×{height} pixels, which is not the shape of the view ({w}×{h})")
     if (height, width) == (h, w):
         return picture
-    return cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA if height > h else cv2.INTER_CUBIC)
+    return _scaled(picture, w, h)
 
 
 def _registered(image: np.ndarray, picture: np.ndarray, outside: np.ndarray) -> tuple[np.ndarray, float, str]:
@@ -298,3 +369,18 @@ def _gain(image: np.ndarray, picture: np.ndarray, where: np.ndarray) -> np.ndarr
 
 def _grey(picture: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
+
+
+PROVIDERS: dict[str, Provider] = {
+    "exemplar": exemplar,
+    "telea": telea,
+    "ns": navier_stokes,
+    "shiftmap": shiftmap,
+    "fsr": fsr,
+}
+
+PROVIDERS_OF: dict[str, Callable[[str, Unfinished], Appearance]] = {  # those that take what follows a colon
+    "file": lambda path, view: paste_picture(view.image, view.hole, read_image(path), path),
+    "onnx": run_model,
+    "command": run_command,
+}

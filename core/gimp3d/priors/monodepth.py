@@ -8,7 +8,6 @@ up to scale). `relative_disparity` brings all of them to disparity of any scale 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from .onnx import OnnxModel, read_model
 
 KINDS = ("disparity", "depth", "metric")
 IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of RGB in [0, 1], as published models were trained
@@ -139,26 +139,11 @@ def _from_file(path: Path, height: int, width: int) -> np.ndarray:
 
 def _from_model(path: Path, image: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
     """[h, w] float32, a network's answer to a picture."""
-    try:
-        model = path.read_bytes()
-        width, height = declared_size(model) or size or FREE_SIZE
-    except OSError as error:
-        raise BadInput(f"--depth-prior onnx: cannot read {path} ({error.strerror})") from None
-    except (IndexError, ValueError):
-        raise BadInput(f"--depth-prior onnx: {path} is not an ONNX model") from None
+    model = read_model("--depth-prior onnx", path)
+    width, height = declared_size(model) or size or FREE_SIZE
     method = cv2.INTER_AREA if width * height < image.shape[0] * image.shape[1] else cv2.INTER_CUBIC
     squeezed = cv2.resize(image, (width, height), interpolation=method).astype(np.float32) / 255
-    blob = np.ascontiguousarray(((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None])
-    level = cv2.setLogLevel(0)  # silent: its complaints come as exceptions too
-    try:
-        net = cv2.dnn.readNetFromONNX(np.frombuffer(model, np.uint8))
-        net.setInput(blob)
-        outputs = net.forward(net.getUnconnectedOutLayersNames())
-    except cv2.error as error:
-        reason = " ".join(str(error.err or error).split())[:200]
-        raise BadInput(f"--depth-prior onnx: OpenCV cannot run {path} ({reason}); export it to a plain ONNX") from None
-    finally:
-        cv2.setLogLevel(level)
+    outputs = model.run({_looking(model): ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]})
     for output in outputs:
         values = np.squeeze(output)
         if values.ndim == 2 and min(values.shape) > 1:
@@ -167,62 +152,12 @@ def _from_model(path: Path, image: np.ndarray, size: tuple[int, int] | None) -> 
     raise BadInput(f"--depth-prior onnx: {path} answers with {shapes}, which is no depth picture")
 
 
-def declared_size(
-    model: bytes,  # an ONNX file
-) -> tuple[int, int] | None:
-    """(width, height) of the first input of four axes [N, C, H, W], or None if the model takes any.
-
-    Reads ModelProto.graph (7) .input (11), leaving out initializers (5): OpenCV does not tell what a model declares.
-
-    Raises
-    ------
-    ValueError, IndexError
-        If the bytes are not a protocol buffer with a graph.
-    """
-    graphs = _messages(memoryview(model), 7)
-    if not graphs:
-        raise ValueError("no graph")
-    constants = {bytes(name) for tensor in _messages(graphs[0], 5) for name in _messages(tensor, 8)}
-    for value in _messages(graphs[0], 11):
-        if bytes(_messages(value, 1)[0]) in constants:
-            continue
-        shapes = [s for t in _messages(value, 2) for tensor in _messages(t, 1) for s in _messages(tensor, 2)]
-        dims = [dict(_fields(dim)).get(1, 0) for shape in shapes for dim in _messages(shape, 1)]
-        if len(dims) == 4:
-            height, width = dims[2:]
-            return (width, height) if isinstance(width, int) and isinstance(height, int) and width * height else None
-    return None
+def declared_size(model: OnnxModel) -> tuple[int, int] | None:
+    """(width, height) of the first input of four axes [N, C, H, W], or None if the model takes any."""
+    dims = model.inputs.get(_looking(model), ())
+    return (dims[3], dims[2]) if len(dims) == 4 and dims[2] * dims[3] else None
 
 
-def _messages(message: memoryview, number: int) -> list[memoryview]:
-    """The length-delimited fields of one number."""
-    return [value for n, value in _fields(message) if n == number and isinstance(value, memoryview)]
-
-
-def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """(field number, value) of a protocol buffer message, in order."""
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
-        kind = key & 7
-        if kind == 0:
-            value, at = _varint(message, at)
-            yield key >> 3, value
-            continue
-        if kind not in (1, 2, 5):
-            raise ValueError(f"wire type {kind}")
-        length, at = _varint(message, at) if kind == 2 else (8 if kind == 1 else 4, at)
-        if at + length > len(message):
-            raise ValueError("cut off")
-        yield key >> 3, message[at : at + length]
-        at += length
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """(value, where it ends): seven bits a byte, the lowest first."""
-    value = shift = 0
-    while True:
-        value |= (message[at] & 127) << shift
-        shift, at = shift + 7, at + 1
-        if message[at - 1] < 128:
-            return value, at
+def _looking(model: OnnxModel) -> str:
+    """The input that takes the picture; a name that no input has lets OpenCV say what is wrong."""
+    return next((name for name, dims in model.inputs.items() if len(dims) == 4), next(iter(model.inputs), ""))

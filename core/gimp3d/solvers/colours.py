@@ -71,6 +71,20 @@ def learn_change(
     )
 
 
+def exposure_gain(
+    before: np.ndarray,  # [N, 3] grey levels
+    after: np.ndarray,  # [N, 3] of the same points
+) -> np.ndarray:
+    """[3] exposure of the second colours over the first ones', by well exposed pairs; 1 where there are few."""
+    gain = np.ones(3)
+    for channel in range(3):
+        a, b = before[:, channel].astype(np.float64), after[:, channel]
+        exposed = (a > 16) & (b > 16) & (a < 250) & (b < 250)
+        if exposed.sum() >= 50:
+            gain[channel] = np.median(b[exposed] / a[exposed])
+    return gain
+
+
 def _exposure(level: np.ndarray, proportional: np.ndarray) -> np.ndarray:
     """[3] the median change, if it is that of another exposure: twice as much for colours twice as bright.
 

@@ -6,24 +6,28 @@ features keep a hole in a detailed texture from being filled with flat patches).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numba import float32
+import scipy.fft
 
 from ..jit import kernel
 from ..threads import run_ranges
-from .patchmatch import (
-    NearestNeighbourField,
-    PatchMatchSettings,
-    patch_centres,
-    refined,
-    upsampled,
-)
+from .greedy import fill_inwards
+from .patch_index import index_patches
+from .patches import lay_out, repainting
+from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
+from .poisson import solve_hole
+from .surface import Surface, coarser, supports, warps, whole_patches
 
-MOST_PEEL_SOURCES = 4096  # patches of the coarsest level that the first guess looks at
-VOTE_ROWS = 8  # rows per piece of work
+VOTE_PIXELS = 1024  # per piece of work
+TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
+DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
+SCREENING = 0.01  # weight of the voted colours beside their gradients
+SELECTIVE = 4.0  # a patch that only a quarter fits worse than votes by e^-4: higher is sharper, and noisier
+LEAST_SAY = 1e-12  # of a patch that fits badly
+FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
 
 @dataclass(frozen=True)
@@ -31,15 +35,15 @@ class ExemplarSettings:
     """Lengths in pixels."""
 
     patch: int = 5  # side, odd
-    texture: float = 5.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
+    texture: float = 20.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
+    thickness: float = 8.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
     smallest: int = 24  # no level is smaller
-    coarse_rounds: int = 12  # of matching and voting on the coarsest level
-    fewer_rounds: int = 3  # by which every finer level has fewer
-    fine_rounds: int = 2  # at least
+    coarse_rounds: int = 6  # of matching and voting on the coarsest level
+    fewer_rounds: int = 3  # by which every finer level has fewer, down to one
     sweeps: int = 2  # of PatchMatch per round
-    rim_trust: float = 1.3  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
+    rim_trust: float = 5.0  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
     settled: float = 0.3  # grey levels; a round that changes less ends its level
-    reach: int = 12  # of the random search below the coarsest level
+    reach: int = 4  # of the random search round the best source
     locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
     seed: int = 0
 
@@ -56,41 +60,170 @@ def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
     settings: ExemplarSettings = ExemplarSettings(),
+    surface: Surface | None = None,  # what the picture shows
 ) -> Completion:
-    """Fill the hole so that every patch of it resembles one outside."""
+    """Fill the hole so that every patch of it resembles one outside.
+
+    With a surface patches are compared and copied along its tangent planes, and what lies on another surface
+    than the patch's centre, such as something that stands in front, is not compared.
+    """
+    if not hole.any():
+        return Completion(image.copy(), 0.0)
     radius = settings.patch // 2
+    if surface is not None:  # what is filled is mixed with nothing
+        surface = surface._replace(clear=surface.clear | hole)
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
-    coarse, open_ = levels[-1]
-    current = _peeled(coarse, open_, radius)
+    if levels[-1][1].all():
+        return Completion(image.copy(), float("nan"))
     field: NearestNeighbourField | None = None
-    for number, (known, open_) in enumerate(reversed(levels)):
-        touching = cv2.dilate(open_.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-        if field is not None:
-            size = (open_.shape[1], open_.shape[0])
-            grown = _resized(current, size, cv2.INTER_LINEAR)
-            field = upsampled(field, touching)
-            current = _voted(np.where(open_[..., None], grown, known), open_, field, settings, 0.0)
-        rounds = max(settings.fine_rounds, settings.coarse_rounds - settings.fewer_rounds * number)
-        current, field = _settled(current, open_, touching, field, radius, rounds, settings)
+    for number, (channels, open_) in enumerate(reversed(levels)):
+        there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
+        level = _prepared(channels, open_, there, radius, settings)
+        rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
+        colours, field = _filled(level, field, rounds, settings)
     assert field is not None
-    filled = np.clip(np.rint(current[..., :3] * 255), 0, 255).astype(np.uint8)
-    return Completion(np.where(hole[..., None], filled, image), _misfit(current, hole, field))
+    sources = image[field.rows[hole], field.cols[hole]]
+    misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
+    filled = image.copy()
+    filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
+    return Completion(filled, misfit)
 
 
-def _misfit(current: np.ndarray, hole: np.ndarray, field: NearestNeighbourField) -> float:
-    inside = hole & field.found
-    difference = (current[inside] - current[field.rows[inside], field.cols[inside]])[:, :3]
-    return 255 * float(np.sqrt(np.mean(difference**2))) if inside.any() else float("nan")
+@dataclass(frozen=True)
+class _Level:
+    """A level of the pyramid and what does not change while it is filled."""
+
+    channels: np.ndarray  # [h, w, 5] float32: colours and texture features
+    hole: np.ndarray  # [h, w] bool
+    touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
+    usable: np.ndarray  # [h, w] bool, pixels to copy
+    allowed: np.ndarray  # [h, w] bool, centres of patches to copy
+    trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
+    surface: Surface | None
+    radius: int
+
+
+def _prepared(
+    channels: np.ndarray, hole: np.ndarray, surface: Surface | None, radius: int, settings: ExemplarSettings
+) -> _Level:
+    touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
+    usable = ~hole if surface is None else ~hole & surface.clear
+    allowed = patch_centres(usable, radius)
+    if not allowed.any():
+        usable, allowed = ~hole, patch_centres(~hole, radius)
+    if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
+        allowed = whole
+    inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
+    trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
+    return _Level(channels, hole, touching, usable, allowed, trust, surface, radius)
+
+
+def _filled(
+    level: _Level, coarser: NearestNeighbourField | None, rounds: int, settings: ExemplarSettings
+) -> tuple[np.ndarray, NearestNeighbourField]:
+    """The hole's channels [N, 5] and the field of one level.
+
+    Patches are matched, then vote for the hole's colours, and again until little changes. A field from the
+    coarser level votes first: averaging what it copies is sharper than enlarging the coarser colours.
+    """
+    hole, allowed, radius = level.hole, level.allowed, level.radius
+    patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
+    guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
+    matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, tree_sweeps=1, reach=settings.reach)
+    if coarser is None:
+        rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.surface, level.usable)
+        colours = level.channels[rows[hole], cols[hole]]
+        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
+        if level.surface is None:
+            index = index_patches(patches, allowed, TREE_GRID)
+        else:
+            matching = replace(matching, reach=max(hole.shape))
+    else:
+        field = upsampled(coarser, level.touching)
+        kept = field.found
+        kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+        field = replace(field, rows=np.where(kept, field.rows, -1))
+        colours = _voted(level, field, level.trust, level.channels[hole])
+    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    penalty = np.float32(settings.locality / hole.shape[1]) * away
+    for number in range(rounds):
+        repaint(patches, colours[:, :3])
+        guides[hole] = colours[:, 3:]
+        matching = replace(matching, seed=settings.seed + 31 * number)
+        field = refined(
+            field, patches, level.touching, allowed, matching, penalty, index, guides, level.surface, level.usable
+        )
+        voted = _voted(level, field, _say(level, field), colours)
+        change = 255 * float(np.abs(voted - colours)[:, :3].mean())
+        colours = voted
+        if change < settings.settled:
+            break
+    return colours, field
+
+
+def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
+    """[touching pixels] float64: the weight of each patch's vote."""
+    costs = field.cost[level.touching]
+    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
+    return level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
+
+
+def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
+    """The hole's colours [N, 3] without seams: the gradients that the patches vote for, fixed at the rim.
+
+    Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Rim pixels that the patches do not
+    agree with at all, such as remains of what was removed, do not spread.
+    """
+    rows, cols = np.nonzero(level.hole)
+    box = np.s_[max(0, rows.min() - 1) : rows.max() + 2, max(0, cols.min() - 1) : cols.max() + 2]
+    hole = level.hole[box]
+    picture = level.channels[box][..., :3].copy()
+    picture[hole] = colours[:, :3]
+    say = _say(level, field)
+
+    def wanted(where: np.ndarray, otherwise: np.ndarray, step: tuple[int, int] = (0, 0)) -> np.ndarray:
+        whole = np.zeros(level.hole.shape, bool)
+        whole[box] = where
+        return _voted(level, field, say, otherwise, whole, step)
+
+    rim = (cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hole & level.usable[box]
+    rim[rim] = np.abs(wanted(rim, picture[rim]) - picture[rim]).max(1) < DISAGREEMENT
+    slopes = []
+    for dy, dx in ((0, 1), (1, 0)):
+        slope = np.zeros_like(picture)
+        slope[: len(slope) - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
+        across = hole.copy()  # pixels whose step to the right or down begins or ends in the hole
+        across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
+        across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
+        slope[across] = wanted(across, slope[across], (dy, dx))
+        slopes.append(slope)
+    drawn = np.where(hole, SCREENING, 0.0)
+    return solve_hole(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values
+
+
+def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT)."""
+    h, w, _ = along_x.shape
+    divergence = np.zeros_like(along_x)
+    divergence[:, :-1] += along_x[:, :-1]
+    divergence[:, 1:] -= along_x[:, :-1]
+    divergence[:-1] += along_y[:-1]
+    divergence[1:] -= along_y[:-1]
+    waves = scipy.fft.dctn(divergence, axes=(0, 1))
+    eigenvalues = 2 * (np.cos(np.pi * np.arange(h) / h)[:, None] + np.cos(np.pi * np.arange(w) / w)) - 4
+    eigenvalues[0, 0] = 1.0
+    return scipy.fft.idctn(waves / eigenvalues[..., None], axes=(0, 1))
 
 
 def _pyramid(
     image: np.ndarray, hole: np.ndarray, radius: int, settings: ExemplarSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(channels [h, w, 5], hole) from fine to coarse, until the hole is about as thin as a patch."""
-    count, thickness = 1, _thickness(hole)
-    while min(hole.shape) > settings.smallest * 2**count and thickness > radius * 2 ** (count - 1):
+    """(channels [h, w, 5]: colours and texture features, hole) from fine to coarse."""
+    thickness = float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
+    count = 1
+    while min(hole.shape) > settings.smallest * 2**count and thickness > settings.thickness * radius * 2 ** (count - 1):
         count += 1
     colours = image.astype(np.float32) / 255
     levels = [(np.dstack([colours, _texture(colours, hole, 2 ** (count - 1), settings.texture)]), hole)]
@@ -116,125 +249,106 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Half the resolution; hole pixels do not mix into their neighbours."""
     size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
     known = (~hole).astype(np.float32)
-    total = _resized(channels * known[..., None], size, cv2.INTER_AREA)
+    visible = channels * known[..., None]
+    parts = visible[..., :3], visible[..., 3:]  # OpenCV takes four channels at most
+    total = np.dstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
     share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
     return total / np.maximum(share, 1e-6)[..., None], share < 0.5
 
 
-def _resized(channels: np.ndarray, size: tuple[int, int], way: int) -> np.ndarray:
-    parts = channels[..., :3], channels[..., 3:]  # OpenCV takes at most four
-    return np.dstack([cv2.resize(part, size, interpolation=way) for part in parts])
-
-
-def _thickness(hole: np.ndarray) -> float:
-    return float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
-
-
-def _peeled(channels: np.ndarray, hole: np.ndarray, radius: int) -> np.ndarray:
-    """The hole filled inwards, ring by ring, each pixel from the patch that best continues the known."""
-    current, open_ = channels.copy(), hole.copy()
-    centres = np.argwhere(patch_centres(~hole, radius)).astype(np.int32)
-    if len(centres) == 0:  # not even one known pixel to copy
-        return current
-    centres = centres[:: -(-len(centres) // MOST_PEEL_SOURCES)]
-    while open_.any():
-        ring = open_ & (cv2.dilate((~open_).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-        filled = current.copy()
-        _fill_ring(np.argwhere(ring), centres, current, open_, radius, filled)
-        current, open_ = filled, open_ & ~ring
-    return current
-
-
-def _settled(
-    current: np.ndarray,
-    hole: np.ndarray,
-    touching: np.ndarray,  # [H, W] bool, centres of the patches that the hole changes
-    field: NearestNeighbourField | None,
-    radius: int,
-    rounds: int,
-    settings: ExemplarSettings,
-) -> tuple[np.ndarray, NearestNeighbourField]:
-    """Match the patches, let them vote for the hole's colours, and again until little changes."""
-    allowed = patch_centres(~hole, radius)
-    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    penalty = np.float32(settings.locality / hole.shape[1]) * away
-    reach = settings.reach if field is not None else 0
-    for number in range(rounds):
-        matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, draws=2, seed=settings.seed + 31 * number)
-        field = refined(field, current, touching, allowed, radius, matching, penalty, reach)
-        sharpness = 1.0 / max(float(np.percentile(field.cost[touching], 75)), 255.0**-2)
-        voted = _voted(current, hole, field, settings, sharpness)
-        change = 255 * float(np.abs(voted - current)[hole][:, :3].mean())
-        current = voted
-        if change < settings.settled:
-            break
-    assert field is not None
-    return current, field
-
-
 def _voted(
-    current: np.ndarray,
-    hole: np.ndarray,
+    level: _Level,
     field: NearestNeighbourField,
-    settings: ExemplarSettings,
-    sharpness: float,
+    say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
+    otherwise: np.ndarray,  # [N, C], where nothing is voted for
+    where: np.ndarray | None = None,  # [h, w] bool, N pixels; None: the hole
+    step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each hole pixel looks like, weighted by how well they fit."""
-    distance = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)
-    trust = (settings.rim_trust ** -np.minimum(distance, 40)).astype(np.float32)
-    voted = current.copy()
-    fitting = field.rows, field.cols, field.cost, trust, np.float32(sharpness), field.radius
-    run_ranges(_vote_rows, len(hole), current, hole, *fitting, voted, chunk=VOTE_ROWS)
+    """What the overlapping patches say each pixel looks like, [N, C] float32."""
+    places = np.argwhere(level.hole if where is None else where)
+    weights = np.zeros(level.hole.shape)
+    weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
+    voted = otherwise.astype(np.float32)
+    parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius
+    if level.surface is None:
+        run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
+    else:
+        number = np.zeros(weights.shape, np.int32)
+        number[level.touching] = np.arange(len(say))
+        support = supports(level.surface, np.argwhere(level.touching), level.radius)
+        warp = warps(level.surface, level.touching, field.rows, field.cols)
+        run_ranges(_vote_slanted, len(places), *parts, level.usable, number, support, warp, voted, chunk=VOTE_PIXELS)
     return voted
 
 
 @kernel
-def _fill_ring(ring, centres, known, open_, radius, out):
-    """Each ring pixel takes its value from the source patch that differs least where its own is known."""
-    h, w, channels = known.shape
-    for k in range(len(ring)):
-        y, x = ring[k]
-        best, best_v, best_u = float32(1e30), 0, 0
-        for s in range(len(centres)):
-            v, u = centres[s]
-            total = float32(0)
-            for dy in range(-radius, radius + 1):
-                for dx in range(-radius, radius + 1):
-                    a, b = y + dy, x + dx
-                    if a < 0 or b < 0 or a >= h or b >= w or open_[a, b]:
-                        continue
-                    for c in range(channels):
-                        d = known[a, b, c] - known[v + dy, u + dx, c]
-                        total += d * d
-                if total >= best:
-                    break
-            if total < best:
-                best, best_v, best_u = total, v, u
-        out[y, x] = known[best_v, best_u]
+def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
+    h, w, _ = channels.shape
+    count, differs = voted.shape[1], dy + dx > 0
+    sums = np.empty(count)
+    for k in range(lo, hi):
+        y, x = places[k]
+        total = 0.0
+        sums[:] = 0.0
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+                weight = weights[a, b]
+                if weight > 0.0:
+                    v, u = rows[a, b] + y - a, cols[a, b] + x - b
+                    total += weight
+                    if differs:
+                        for c in range(count):
+                            sums[c] += weight * (channels[v + dy, u + dx, c] - channels[v, u, c])
+                    else:
+                        for c in range(count):
+                            sums[c] += weight * channels[v, u, c]
+        if total > 0.0:
+            for c in range(count):
+                voted[k, c] = sums[c] / total
 
 
 @kernel
-def _vote_rows(lo, hi, current, hole, rows, cols, cost, trust, sharpness, radius, voted):
-    h, w, channels = current.shape
-    colour = np.empty(channels, np.float32)
-    for y in range(lo, hi):
-        for x in range(w):
-            if not hole[y, x]:
-                continue
-            total = float32(0)
-            colour[:] = 0
-            for dy in range(-radius, radius + 1):
-                for dx in range(-radius, radius + 1):
-                    a, b = y + dy, x + dx
-                    if a < 0 or b < 0 or a >= h or b >= w or rows[a, b] < 0:
-                        continue
-                    v, u = rows[a, b] - dy, cols[a, b] - dx
-                    if v < 0 or u < 0 or v >= h or u >= w:  # an upsampled field may point past the edge
-                        continue
-                    weight = trust[a, b] * np.exp(-cost[a, b] * sharpness) + float32(1e-12)
-                    total += weight
-                    for c in range(channels):
-                        colour[c] += weight * current[v, u, c]
-            if total > 0:
-                for c in range(channels):
-                    voted[y, x, c] = colour[c] / total
+def _vote_slanted(
+    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, number, support, warp, voted
+):  # fmt: skip
+    """Only pixels on the surface of a patch's centre; colours between four pixels of which all may be copied."""
+    h, w, _ = channels.shape
+    count, ends = voted.shape[1], 2 if dy + dx > 0 else 1
+    sums, one = np.empty(count), np.empty(count)
+    side = 2 * radius + 1
+    for k in range(lo, hi):
+        y, x = places[k]
+        total = 0.0
+        sums[:] = 0.0
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+                n, votes = number[a, b], weights[a, b] > 0.0
+                one[:] = 0.0
+                for end in range(ends):
+                    i, j = y + end * dy - a, x + end * dx - b
+                    if not votes or support[n, (i + radius) * side + j + radius] == 0:
+                        votes = False
+                        break
+                    fu = cols[a, b] + warp[n, 0] * j + warp[n, 1] * i
+                    fv = rows[a, b] + warp[n, 2] * j + warp[n, 3] * i
+                    if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
+                        votes = False
+                        break
+                    v, u = int(fv), int(fu)
+                    v1, u1 = min(v + 1, h - 1), min(u + 1, w - 1)
+                    if not (usable[v, u] and usable[v, u1] and usable[v1, u] and usable[v1, u1]):
+                        votes = False
+                        break
+                    s, t = fv - v, fu - u
+                    sign = 1.0 if end == ends - 1 else -1.0
+                    for c in range(count):
+                        top = (1 - t) * channels[v, u, c] + t * channels[v, u1, c]
+                        bottom = (1 - t) * channels[v1, u, c] + t * channels[v1, u1, c]
+                        one[c] += sign * ((1 - s) * top + s * bottom)
+                if votes:
+                    total += weights[a, b]
+                    for c in range(count):
+                        sums[c] += weights[a, b] * one[c]
+        if total > 0.0:
+            for c in range(count):
+                voted[k, c] = sums[c] / total

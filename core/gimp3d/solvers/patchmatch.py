@@ -1,14 +1,15 @@
-"""Nearest-neighbour fields by multi-scale PatchMatch (Barnes 2009; paper Algorithm 2 with its loop mended).
+"""Nearest-neighbour fields: a kd-tree's guesses, propagated and refined by PatchMatch sweeps, from coarse to fine.
 
-The target is swept in fixed bands of rows, so that the result depends on the seed and not on the number of
-threads: inside a band propagation sees this sweep's values, across a band's edge the last sweep's. Random
-numbers are hashes of seed, sweep and pixel.
+Sources come from a tree over the patches' main components and from the leaves of the neighbours' sources (He & Sun
+2012), then from propagation and random search (Barnes 2009; paper Algorithm 2 with its loop mended). The target is
+swept in fixed bands of rows, so that the result depends on the seed and not on the number of threads: inside a band
+propagation sees this sweep's values, across a band's edge the last sweep's. Random numbers are hashes of seed, sweep
+and pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,11 +18,18 @@ import numpy as np
 from numba import float32, int64, uint32
 
 from ..jit import inline_kernel, kernel
+from ..raster.vec16 import any_between, fma16, load1, load16, splat16, store16, sum16
 from ..threads import parallel_map
+from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
+from .patches import Patches, coordinates, lay_out
+from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
 SMALLEST = 32  # px, no level is smaller
+NO_LOOKS, NO_SUPPORT = np.empty(0, np.float32), np.empty((0, 0), np.uint8)
+IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
+SAME = np.float32(255.0**-2 / 4)  # half a grey level: the tree is not asked for better, or plain areas lose coherence
 TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only decides between equal patches
 
 
@@ -32,9 +40,12 @@ class PatchMatchSettings:
     patch: int = 5  # side, odd (paper 4.1)
     coherence: float = 0.001  # λ_s, weight of the spatial term (paper 4.1)
     truncation: float = 8.0  # offsets that differ by more are incoherent (METHOD section 4: local, not image-sized)
-    levels: int = 5  # of the pyramid, at most
-    sweeps: int = 5  # per level
-    draws: int = 4  # random candidates per octave of distance and sweep
+    levels: int = 1  # of the pyramid, at most
+    grid: int = 2  # spacing of the sources that the tree holds; sweeps look at those between
+    tree_sweeps: int = 2  # that look into the neighbours' leaves of the tree
+    sweeps: int = 4  # per level, those among them
+    surface_sweeps: int = 3  # along a surface, after all others
+    reach: int = 4  # of the random search round the best source
     seed: int = 0
 
 
@@ -59,6 +70,7 @@ def nearest_neighbour_field(
     source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
     penalty: np.ndarray | None = None,  # [H, W] float32 ≥ 0, added to the cost of each source
     settings: PatchMatchSettings = PatchMatchSettings(),
+    surface: Surface | None = None,  # what the picture shows
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most, found from the coarsest level to the finest.
 
@@ -66,6 +78,9 @@ def nearest_neighbour_field(
     difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
     scaled to [0, 1] (PixMix, Herling & Broll 2014). A source patch lies inside the image and holds no target
     pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
+
+    With a surface patches lie on its tangent planes, sources on other planes or of other orientations cost more, and
+    those seen more than twice as large or small are not taken (METHOD section 4) – unless there is no other.
     """
     radius = settings.patch // 2
     while radius > 0 and not (source & patch_centres(~target, radius)).any():
@@ -81,9 +96,23 @@ def nearest_neighbour_field(
     for picture, inside, centres, extra in reversed(levels):
         allowed = centres & patch_centres(~inside, radius)
         start = None if field is None else upsampled(field, inside)
-        field = refined(start, picture, inside, allowed, radius, settings, extra)
+        patches = lay_out(picture, radius)
+        index = index_patches(patches, allowed, settings.grid) if allowed.any() and inside.any() else None
+        field = refined(start, patches, inside, allowed, settings, extra, index)
     assert field is not None
-    return field
+    if surface is None or not field.found.any():
+        return field
+    patches = lay_out(levels[0][0], radius)
+    allowed = source & patch_centres(~target, radius)
+    reach = replace(settings, sweeps=settings.surface_sweeps, reach=max(target.shape) // 4)
+    along = refined(field, patches, target, allowed, reach, levels[0][3], surface=surface)
+    kept = along.cost < IMPOSSIBLE
+    rows, cols, cost = (np.where(kept, a, b) for a, b in zip(_arrays(along), _arrays(field)))
+    return NearestNeighbourField(rows, cols, cost, radius)
+
+
+def _arrays(field: NearestNeighbourField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return field.rows, field.cols, field.cost
 
 
 def patch_centres(
@@ -120,47 +149,74 @@ def upsampled(
 
 
 def refined(
-    field: NearestNeighbourField | None,  # a first guess; random where it has no allowed source
-    channels: np.ndarray,  # [H, W, C] float32: colours in [0, 1], and what else is to be compared
+    field: NearestNeighbourField | None,  # a first guess; where it has no allowed source the nearest one is tried
+    patches: Patches,
     target: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, source patch centres
-    radius: int,
     settings: PatchMatchSettings,
     penalty: np.ndarray | None = None,  # [H, W] float32
-    reach: int = 0,  # px of the random search; 0 = everywhere
+    index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
+    guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
+    surface: Surface | None = None,  # compare patches on its tangent planes
+    usable: np.ndarray | None = None,  # [H, W] bool, pixels that slanted patches may be copied from; None: not target
 ) -> NearestNeighbourField:
-    """Sweeps of propagation and random search at one resolution."""
+    """Sweeps at one resolution."""
     h, w = target.shape
     rows, cols = np.full((2, h, w), -1, np.int32)
     cost = np.zeros((h, w), np.float32)
-    centres = np.argwhere(allowed).astype(np.int32)
-    if len(centres) == 0 or not target.any():
-        return NearestNeighbourField(rows, cols, cost, radius)
-    if field is not None:
-        rows[:], cols[:] = field.rows, field.cols
-    size = 2 * radius + 1
-    padded = cv2.copyMakeBorder(channels, radius, radius, radius, radius, cv2.BORDER_REFLECT_101)
-    means = np.ascontiguousarray(cv2.blur(padded, (size, size))[radius : radius + h, radius : radius + w])
-    padded = np.ascontiguousarray(padded.reshape(len(padded), -1))
+    if not allowed.any() or not target.any():
+        return NearestNeighbourField(rows, cols, cost, patches.radius)
+    start = _first_guess(field, target, allowed)
     extra = np.zeros((h, w), np.float32) if penalty is None else penalty
-    weight = float32(1 - settings.coherence)
+    guides = np.empty((h, w, 0), np.float32) if guides is None else guides
+    weights = np.array([1 - settings.coherence, settings.coherence, settings.truncation**2, TIE / w], np.float32)
+    looks, number, support = NO_LOOKS, np.zeros((h, w), np.int32), NO_SUPPORT
+    wanted = np.nonzero(target)
+    number[wanted] = np.arange(len(wanted[0]))
+    if surface is not None:
+        support = supports(surface, np.stack(wanted, 1), patches.radius)
+    if index is not None:
+        looks = coordinates(patches, index.components, patches.starts(*wanted)).ravel()
+    tree = NO_TREE if index is None else index.tree
     bands = row_bands(target)
-    random = uint32(settings.seed * 1009 & 0xFFFFFFFF)
-    setup = target, allowed, padded, extra, radius, weight, random, centres, rows, cols, cost
-    parallel_map(partial(_run_band, _start_band, setup), bands)
-    limits = float32(settings.coherence), float32(settings.truncation**2), float32(TIE / w)
     for sweep in range(settings.sweeps):
-        random = uint32((settings.seed * 1009 + sweep + 1) & 0xFFFFFFFF)
-        sweeping = (
-            target, allowed, padded, means, extra, radius, weight, *limits, reach or h + w, settings.draws,
-            sweep % 2 == 0, random, rows.copy(), cols.copy(), rows, cols, cost,
+        arguments = (
+            target, allowed, *patches, extra, *weights, guides,
+            *tree, index is not None and sweep < settings.tree_sweeps, looks, number,
+            surface is not None, *(surface or NO_SURFACE), support, ~target if usable is None else usable,
+            *start, sweep == 0, sweep % 2 == 0, settings.reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
+            rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
-        parallel_map(partial(_run_band, _sweep_band, sweeping), bands)
-    return NearestNeighbourField(rows, cols, cost, radius)
+        parallel_map(partial(_run_band, arguments), bands)
+    return NearestNeighbourField(rows, cols, cost, patches.radius)
 
 
-def _run_band(work: Callable[..., None], arguments: tuple[Any, ...], band: tuple[int, int]) -> None:
-    work(*band, *arguments)
+def _run_band(arguments: tuple[Any, ...], band: tuple[int, int]) -> None:
+    _sweep_band(*band, *arguments)
+
+
+def _first_guess(
+    field: NearestNeighbourField | None, target: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The field where its sources are allowed, elsewhere the nearest allowed ones."""
+    if field is None:
+        return nearest_allowed(allowed)
+    kept = field.found & target
+    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+    if (kept == target).all():
+        return field.rows, field.cols
+    rows, cols = nearest_allowed(allowed)
+    return np.where(kept, field.rows, rows), np.where(kept, field.cols, cols)
+
+
+def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, cols) [H, W] int32 of the allowed pixel nearest to each pixel."""
+    blocked = (~allowed).astype(np.uint8)
+    _, labels = cv2.distanceTransformWithLabels(blocked, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    places = np.zeros(labels.max() + 1, np.int32)
+    places[labels[allowed]] = np.flatnonzero(allowed)
+    nearest = places[labels]
+    return nearest // allowed.shape[1], nearest % allowed.shape[1]
 
 
 def row_bands(target: np.ndarray) -> list[tuple[int, int]]:
@@ -175,131 +231,170 @@ def row_bands(target: np.ndarray) -> list[tuple[int, int]]:
 @inline_kernel
 def _hash(x):
     x ^= x >> uint32(16)
-    x *= uint32(0x7FEB352D)
+    x = uint32(x * uint32(0x7FEB352D))
     x ^= x >> uint32(15)
-    x *= uint32(0x846CA68B)
-    return x ^ (x >> uint32(16))
-
-
-@inline_kernel
-def _appearance(padded, channels, y, x, v, u, radius, limit):
-    """Mean squared difference of the patches at (y, x) and (v, u), or anything ≥ limit once that is sure."""
-    size = 2 * radius + 1
-    scale = float32(1.0) / float32(channels * size * size)
-    total = float32(0)
-    for k in range(size):
-        for c in range(channels * size):
-            d = padded[y + k, channels * x + c] - padded[v + k, channels * u + c]
-            total += d * d
-        if total * scale >= limit:
-            break
-    return total * scale
-
-
-@inline_kernel
-def _mean_difference(means, y, x, v, u):
-    """Squared difference of the patches' means: by Jensen's inequality never above their appearance term."""
-    total = float32(0)
-    for c in range(means.shape[2]):
-        d = means[y, x, c] - means[v, u, c]
-        total += d * d
-    return total / float32(means.shape[2])
-
-
-@inline_kernel
-def _incoherence(target, lo, hi, old_rows, old_cols, rows, cols, y, x, v, u, truncation):
-    """Mean over the 4-neighbours of the truncated squared deviation of offsets, in [0, 1].
-
-    Neighbours in this band are up to date, others are as the last sweep left them.
-    """
-    total, count = float32(0), 0
-    for k in range(4):
-        dy, dx = (k == 0) - (k == 1), (k == 2) - (k == 3)
-        a, b = y + dy, x + dx
-        if 0 <= a < target.shape[0] and 0 <= b < target.shape[1] and target[a, b]:
-            q, p = (rows[a, b], cols[a, b]) if lo <= a < hi else (old_rows[a, b], old_cols[a, b])
-            total += min(float32((v + dy - q) ** 2 + (u + dx - p) ** 2), truncation)
-            count += 1
-    return total / (truncation * float32(max(count, 1)))
-
-
-@inline_kernel
-def _distance(y, x, v, u):
-    return np.sqrt(float32((y - v) ** 2 + (x - u) ** 2))
-
-
-@kernel
-def _start_band(lo, hi, target, allowed, padded, penalty, radius, weight, random, centres, rows, cols, cost):
-    """Keep allowed sources, draw random ones elsewhere, and cost them all."""
-    w = target.shape[1]
-    channels = padded.shape[1] // (w + 2 * radius)
-    for y in range(lo, hi):
-        for x in range(w):
-            if target[y, x]:
-                if rows[y, x] < 0 or not allowed[rows[y, x], cols[y, x]]:
-                    k = int64(_hash(uint32(y * w + x) ^ _hash(random))) % len(centres)
-                    rows[y, x], cols[y, x] = centres[k, 0], centres[k, 1]
-                v, u = rows[y, x], cols[y, x]
-                cost[y, x] = weight * _appearance(padded, channels, y, x, v, u, radius, float32(1e30)) + penalty[v, u]
-            else:
-                rows[y, x], cols[y, x] = -1, -1
+    x = uint32(x * uint32(0x846CA68B))
+    return uint32(x ^ (x >> uint32(16)))
 
 
 @kernel
 def _sweep_band(
-    lo, hi, target, allowed, padded, means, penalty, radius, weight, coherence, truncation, tie, reach, draws,
-    downward, random, old_rows, old_cols, rows, cols, cost,
+    lo, hi, target, allowed, values, stride, channels, radius, row_weights, penalty,
+    weight, coherence, truncation, tie, guides,
+    features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
+    slanted, point, normal, frame, inverse, plane, clear, support, usable,
+    start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost,
 ):  # fmt: skip
-    """One sweep over rows [lo, hi): candidates are the neighbours' sources, shifted, and random ones."""
+    """One sweep over rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones near.
+
+    The first sweep begins with `start` and each patch's own leaf. Neighbours in this band are up to date, others
+    are as the last sweep left them. A candidate's cost is found in one place, written out: a helper that takes
+    arrays would count references for each.
+    """
     h, w = target.shape
-    channels = means.shape[2]
+    size = 2 * radius + 1
     step = 1 if downward else -1
     salt = _hash(random)
+    bounds = np.empty(16, np.float32)
+    to_scan = np.empty(3, np.int64)
     for i in range(hi - lo):
         y = lo + i if downward else hi - 1 - i
         for j in range(w):
             x = j if downward else w - 1 - j
             if not target[y, x]:
                 continue
-            v, u = rows[y, x], cols[y, x]
-            best = cost[y, x] + tie * _distance(y, x, v, u)
-            if coherence > 0:
-                best += coherence * _incoherence(target, lo, hi, old_rows, old_cols, rows, cols, y, x, v, u, truncation)
+            here, at, scans = y * stride + x * channels, int64(number[y, x]) * 16, 0
+            if first:
+                v, u = int64(start_rows[y, x]), int64(start_cols[y, x])
+                if in_leaves:
+                    to_scan[0], scans = leaf_of(looks, at, split_component, split_value), 1
+            else:
+                v, u = int64(rows[y, x]), int64(cols[y, x])
             state = _hash(uint32(y * w + x) ^ salt)
-            candidate, span = 0, reach
-            while span > 0:
-                if candidate < 4:
-                    # the two neighbours visited just now, then the two that the last sweep left
-                    dy = (-step, 0, step, 0)[candidate]
-                    dx = (0, -step, 0, step)[candidate]
-                    a, b = y + dy, x + dx
-                    candidate += 1
+            best, own = float32(1e30), float32(0)
+            turn, block, lane, span = 0, 0, 16, reach
+            while True:
+                bound = float32(0)
+                if turn == 0:
+                    q, p = v, u
+                    turn = 1
+                elif turn < 3:  # the two neighbours visited just now
+                    dy, dx = (step, 0) if turn == 1 else (0, step)
+                    a, b = y - dy, x - dx
+                    turn += 1
                     if a < 0 or b < 0 or a >= h or b >= w or not target[a, b]:
                         continue
                     q, p = (rows[a, b], cols[a, b]) if lo <= a < hi else (old_rows[a, b], old_cols[a, b])
-                    q, p = q - dy, p - dx
-                else:
-                    state = _hash(state + uint32(0x9E3779B9))
-                    q = v - span + int64(state) % (2 * span + 1)
-                    state = _hash(state + uint32(0x9E3779B9))
-                    p = u - span + int64(state) % (2 * span + 1)
-                    candidate += 1
-                    if (candidate - 4) % draws == 0:
-                        span //= 2
-                if q < 0 or p < 0 or q >= h or p >= w or not allowed[q, p] or (q == v and p == u):
-                    continue
-                extra = penalty[q, p] + tie * _distance(y, x, q, p)
-                if extra + weight * _mean_difference(means, y, x, q, p) >= best:
-                    continue
-                if coherence > 0:
-                    extra += coherence * _incoherence(
-                        target, lo, hi, old_rows, old_cols, rows, cols, y, x, q, p, truncation
-                    )
-                    if extra >= best:
+                    q, p = int64(q), int64(p)
+                    if slanted and q >= 0:
+                        k = 0 if dx else 1  # the column of A: one step along x or along y
+                        xx, xy = frame[q, p, 0] * inverse[a, b, k], frame[q, p, 1] * inverse[a, b, k + 2]
+                        yx, yy = frame[q, p, 2] * inverse[a, b, k], frame[q, p, 3] * inverse[a, b, k + 2]
+                        q += int64(np.floor(step * (yx + yy) + float32(0.5)))
+                        p += int64(np.floor(step * (xx + xy) + float32(0.5)))
+                    else:
+                        q, p = q + dy, p + dx
+                    if q < 0 or p < 0 or q >= h or p >= w:
                         continue
-                found = weight * _appearance(padded, channels, y, x, q, p, radius, (best - extra) / weight)
+                    if in_leaves:
+                        leaf = int64(grid[q // grid_step, p // grid_step])
+                        known = leaf < 0
+                        for k in range(scans):
+                            known |= to_scan[k] == leaf
+                        if not known:
+                            to_scan[scans] = leaf
+                            scans += 1
+                elif lane < 16:  # the patches of a leaf that may be better
+                    bound = weight * bounds[lane]
+                    q, p = int64(tree_rows[block + lane]), int64(tree_cols[block + lane])
+                    lane += 1
+                    if bound >= best:
+                        continue
+                elif scans > 0:
+                    scans -= 1
+                    if own < SAME:
+                        continue
+                    block = to_scan[scans] * 16
+                    total = splat16(float32(0))
+                    for k in range(16):
+                        d = load16(features, (block + k) * 16) - load1(looks, at + k)
+                        total = fma16(d, d, total)
+                    if any_between(total, float32(-1), best / weight):
+                        store16(bounds, 0, total)
+                        lane = 0
+                    continue
+                elif span > 0:
+                    state = _hash(state + uint32(0x9E3779B9))
+                    side = 2 * span + 1
+                    q = v - span + (int64(state >> uint32(16)) * side >> 16)
+                    p = u - span + (int64(state & uint32(0xFFFF)) * side >> 16)
+                    span //= 2
+                else:
+                    break
+                if q < 0 or p < 0 or q >= h or p >= w or not allowed[q, p]:
+                    continue
+                extra = penalty[q, p] + tie * np.sqrt(float32((y - q) ** 2 + (x - p) ** 2))
+                if coherence > 0:  # the 4 neighbours' mean truncated squared deviation of offsets, in [0, 1]
+                    if extra + bound >= best:
+                        continue
+                    total_deviation, count = float32(0), 0
+                    for k in range(4):
+                        dy, dx = (k == 0) - (k == 1), (k == 2) - (k == 3)
+                        a, b = y + dy, x + dx
+                        if 0 <= a < h and 0 <= b < w and target[a, b]:
+                            c, d = (rows[a, b], cols[a, b]) if lo <= a < hi else (old_rows[a, b], old_cols[a, b])
+                            if c >= 0:
+                                total_deviation += min(float32((q + dy - c) ** 2 + (p + dx - d) ** 2), truncation)
+                                count += 1
+                    extra += coherence * total_deviation / (truncation * float32(max(count, 1)))
+                for k in range(guides.shape[2]):
+                    extra += (guides[y, x, k] - guides[q, p, k]) ** 2
+                if extra + bound >= best:
+                    continue
+                one, other = here, q * stride + p * channels
+                if slanted:
+                    xx = frame[q, p, 0] * inverse[y, x, 0] + frame[q, p, 1] * inverse[y, x, 2]
+                    xy = frame[q, p, 0] * inverse[y, x, 1] + frame[q, p, 1] * inverse[y, x, 3]
+                    yx = frame[q, p, 2] * inverse[y, x, 0] + frame[q, p, 3] * inverse[y, x, 2]
+                    yy = frame[q, p, 2] * inverse[y, x, 1] + frame[q, p, 3] * inverse[y, x, 3]
+                    turned, off = float32(0), float32(0)
+                    for k in range(3):
+                        turned += (normal[y, x, k] - normal[q, p, k]) ** 2
+                        off += normal[y, x, k] * (point[q, p, k] - point[y, x, k])
+                    off /= point[y, x, 2]
+                    extra += NORMAL * turned + min(OFF_PLANE * off * off, FURTHEST_OFF)
+                    if extra + bound >= best:
+                        continue
+                    areas = xx * yy - xy * yx
+                    found, count = float32(0), 0 if SCALES[0] <= areas <= SCALES[1] else -1
+                    for k in range(size * size):
+                        if count < 0 or support[number[y, x], k] == 0:
+                            continue
+                        dy, dx = k // size - radius, k % size - radius
+                        c = q + int64(np.floor(yx * dx + yy * dy + float32(0.5)))
+                        d = p + int64(np.floor(xx * dx + xy * dy + float32(0.5)))
+                        if c < 0 or d < 0 or c >= h or d >= w or not usable[c, d]:
+                            count = -1
+                            continue
+                        count += 1
+                        one = here + (dy + radius) * stride + (dx + radius) * channels
+                        other = (c + radius) * stride + (d + radius) * channels
+                        for n in range(channels):
+                            found += (values[one + n] - values[other + n]) ** 2
+                    if count < 0:
+                        found = IMPOSSIBLE
+                    else:
+                        found *= weight / float32(count * channels)
+                else:
+                    total = splat16(float32(0))
+                    for _ in range(size):
+                        for k in range(0, len(row_weights), 16):
+                            difference = load16(values, one + k) - load16(values, other + k)
+                            total = fma16(difference * load16(row_weights, k), difference, total)
+                        one += stride
+                        other += stride
+                    found = weight * sum16(total)
                 if found + extra < best:
-                    best = found + extra
+                    best, own = found + extra, found + penalty[q, p]
                     v, u = q, p
-                    cost[y, x] = found + penalty[q, p]
-            rows[y, x], cols[y, x] = v, u
+            rows[y, x], cols[y, x], cost[y, x] = v, u, own

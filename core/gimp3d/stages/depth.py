@@ -162,7 +162,12 @@ def complete_disparity(
         surface = "harmonic" if part.sum() <= settings.small_part else settings.surface
         plan = choose_plan(around, replace(settings, surface=surface), insist=not done)
         missed = withheld_miss(around, plan, settings, around.rim)
-        settled = _settle(fill(around, plan, settings), around, fit.shift, settings)
+        filled = fill(around, plan, settings)
+        if own_guide is not None and settings.scale_factor is None and surface not in ("harmonic", "planar"):
+            filled, believed = _as_far_as_believed(filled, missed, around, settings)
+            if believed < 0.95:
+                reasons.append(f"prior believed by {believed:.0%}, as the surroundings are told better without it")
+        settled = _settle(filled, around, fit.shift, settings)
         result[window][inside] = settled.disparity[inside]
         trust[window][inside] = (settled.share * fit.confidence * _trust(around, missed, settings))[inside]
         reasons += [*([] if done else [plan.reason]), *settled.notes]
@@ -173,6 +178,25 @@ def complete_disparity(
     reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
     clamped = sum(s.clamped for s in done)
     return _completion(result, replace(fit, confidence=confidence, reason=reason), trust, clamped)
+
+
+def _as_far_as_believed(
+    guided: np.ndarray,  # [H, W] the hole's disparity with the prior
+    missed: float,  # by it on the withheld band
+    around: Surroundings,
+    settings: DepthSettings,
+) -> tuple[np.ndarray, float]:
+    """The hole with as much of the prior as its miss on a withheld band allows, and how much that is.
+
+    Gradients tell a prior's scale, but not that its error is larger than what planes or a plate miss without it.
+    """
+    alone = replace(around, guide=None)
+    plan = choose_plan(alone, settings, insist=False)
+    ratio = missed / max(withheld_miss(alone, plan, settings, around.rim), 1e-9)
+    believed = 1.0 if np.isnan(ratio) else 1 / (1 + (ratio / settings.prior_miss) ** 8)
+    if believed >= 0.99:
+        return guided, 1.0
+    return believed * guided + (1 - believed) * fill(alone, plan, settings), believed
 
 
 def _without_gaps(prior: np.ndarray) -> np.ndarray:

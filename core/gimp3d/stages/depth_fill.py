@@ -38,6 +38,9 @@ class DepthSettings:
     minimum_ring: int = 10  # ring pixels below which nothing can be measured
     minimum_correlation: float = 0.2  # between the prior's and the scene's gradients
     full_correlation: float = 0.7  # from which the measured s_f is used whole; below, its square shares it
+    prior_miss: float = (
+        3.0  # times a plate's miss without a prior at which it is believed by half; half that for planes
+    )
     least_island: float = 0.02  # share of the hole that evidence must hold to stand alone before the surface
     small_part: int = 64  # pixels up to which a part of the hole is just interpolated
     low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]

@@ -10,7 +10,9 @@ import numpy as np
 from ..camera import Camera
 from ..jit import exact_kernel
 from ..solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field
+from ..solvers.surface import tangent_planes
 from ..threads import run_ranges
+from .reference import disparity_of
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 
@@ -21,6 +23,7 @@ class MappingSettings:
 
     visibility: float = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
     depth_tolerance: float = 0.02  # z-test of visibility, relative
+    geometry: bool = True  # patches lie on the surface (METHOD section 4); the paper's lie in the picture
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
 
@@ -72,6 +75,8 @@ def mapping_field(
     visibility: np.ndarray,  # [H, W] float32, see source_visibility
     settings: MappingSettings = MappingSettings(),
     seed: int = 0,
+    camera: Camera | None = None,
+    depth: np.ndarray | None = None,  # [H, W] z-depth of the completed reference, 0 = nothing
 ) -> MappingField:
     """The field f* that minimises misfit, incoherence and λ_v (1 − v) over T_0 (paper eq. 8, sign mended).
 
@@ -79,7 +84,10 @@ def mapping_field(
     """
     penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
     patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
-    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
+    surface = None
+    if settings.geometry and camera is not None and depth is not None:
+        surface = tangent_planes(disparity_of(depth), camera.K)
+    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch, surface)
     found = nearest.found
     if not target.any():
         confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from ..box import Region
+from ..box import Region, in_region
 from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
@@ -29,19 +29,23 @@ from .outline import (
     window_round,
 )
 from .selection import (
+    Fate,
     Selection,
     SelectionSettings,
     Sighting,
+    boxes_of,
     by_centre,
     object_and_rim,
     select,
     select_removed,
+    standing,
+    surface_in,
     weigh,
     weigh_revealed,
     without_revealed,
 )
 from .surroundings import follow_surroundings
-from .visibility import Sight, depth_agreement
+from .visibility import HIDES, SHOWN, Sight, depth_agreement
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -61,7 +65,8 @@ class MaskSettings:
     depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
     near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
     layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
-    occluder_step: float = 0.06  # how much nearer (relative) a kept surface counts as in front
+    occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
+    infinity: float = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
@@ -147,16 +152,17 @@ def find_masks(
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
     selection = by_centre(inside)
     if not settings.selection.by_centre:
-        selection = _choose(gaussians, region, before, passes, settings.selection)
+        selection, before = _choose(gaussians, region, before, passes, settings.selection)
     kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
-    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)])
-    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, settings), range(len(after)))
+    centre = np.mean([box.center for box in region], axis=0)
+    sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)], centre)
+    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, centre, settings), range(len(after)))
     mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
     if warnings or mode == "paper":
         mode = "paper"
         needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
-    views = tuple(_view_masks(b, a, n, mode, settings) for b, a, n in zip(before, after, needed))
+    views = tuple(_view_masks(b, a, n, not warnings, settings) for b, a, n in zip(before, after, needed))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
@@ -262,27 +268,44 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 def _choose(
     gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
-) -> Selection:
-    """Which Gaussians go, by what the views show of them."""
+) -> tuple[Selection, list[_Before]]:
+    """Which Gaussians go, by what the views show of them; and the views, with what else the user named masked out.
+
+    Where nothing stands out of the surface in a box, the surface itself is meant: a shadow, a picture on the floor.
+    """
     depths = [(b.camera, b.depth) for b in before]
     surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
+    centre = by_centre(select_removed(gaussians, region))
+    if all(box.size.max() < settings.least_cells * s.cell for box, s in zip(region, surroundings)):
+        return centre, list(before)  # pictures this small show no surface to follow
+    seen = passes.over(lambda b: object_and_rim(b.camera, b.depth, region, surroundings, settings), before)
+    members = [boxes_of(b.camera, np.where(o, b.depth, 0), region, surroundings) for b, (o, _) in zip(before, seen)]
+    stands = standing(members, [int(_polygon_pixels(b).sum()) for b in before], settings.least_object)
+    objects = tuple(box for box, s in zip(region, stands) if s)
+    named = tuple(box for box, s in zip(region, stands) if not s)
 
-    def sighting(view: _Before) -> Sighting:
-        object_, ring = object_and_rim(view.camera, view.depth, region, surroundings, settings)
+    def with_named(view: _Before) -> _Before:
+        mask = surface_in(view.camera, view.depth, named) & ~surface_in(view.camera, view.depth, objects)
+        return replace(view, extra=mask if view.extra is None else mask | view.extra)
+
+    views = parallel_map(with_named, before) if named else list(before)
+    if not objects:
+        return centre, views
+
+    def sighting(view: _Before, object_: np.ndarray, ring: np.ndarray) -> Sighting:
         clear = view.agrees & ~object_ & ~ring
         if view.extra is not None:
             object_, clear = object_ & ~view.extra, clear & ~view.extra
         return Sighting(view.camera, object_, clear, view.extra)
 
-    sightings = passes.over(sighting, before)
-    if not any(s.object_.sum() > settings.least_object * _polygon_pixels(b).sum() for s, b in zip(sightings, before)):
-        return by_centre(select_removed(gaussians, region))  # nothing stands out: the surface itself is meant
+    sightings = [sighting(v, *s) for v, s in zip(views, seen)]
     weights = weigh(gaussians, sightings)
-    selection = select(gaussians, region, weights, surroundings, settings)
-    if settings.support == 0:
-        return selection
-    revealed = weigh_revealed(gaussians, selection, sightings)
-    return without_revealed(gaussians, selection, region, weights.clear, revealed, settings)
+    selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o], settings)
+    if settings.support > 0:
+        revealed = weigh_revealed(gaussians, selection, sightings)
+        selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, settings)
+    alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
+    return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), selection.fates)), views
 
 
 def _without(
@@ -308,16 +331,33 @@ def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.nda
     return hidden if before.extra is None else hidden | before.extra
 
 
-def _needed(camera: Camera, after: _After, sight: Sight, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1)."""
+def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, settings: MaskSettings) -> np.ndarray:
+    """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1).
+
+    A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
+    seen are the edge of what stands before it, as splats blur it. Parts thinner than 3 px are mostly depth edges, where
+    a pixel's depth is of neither side, or surface that views place a little differently. They count only where that is
+    excluded: no view sees past what appears there or shows it within twice the tolerance, and the object hides it from
+    more views than other surfaces do.
+    """
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
     window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
     rows, cols, points = surface_points(camera, np.where(solid, after.depth, 0), window)
     evidence = touched & (after.alpha < settings.void)
-    evidence[rows, cols] = sight.shows(points, settings.depth_tolerance)
-    evidence[window] &= _continues_outside(after.depth[window], after.alpha[window], touched[window], settings)
-    return touched & ~evidence
+    distance = float(np.linalg.norm(camera.centre - centre))
+    shown = sight.of(points, settings.depth_tolerance) == SHOWN
+    evidence[rows, cols] = shown | (after.depth[rows, cols] > settings.infinity * distance)
+    continues = np.zeros_like(touched)
+    continues[window] = _continues_outside(
+        after.depth[window], after.alpha[window], touched[window], distance, settings
+    )
+    evidence &= continues
+    void = (continues & (after.alpha < settings.void)).astype(np.uint8)
+    evidence |= touched & ~solid & (cv2.dilate(void, np.ones((7, 7), np.uint8)) > 0)
+    certain = after.weight > settings.hides
+    certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == HIDES
+    return _tidy(touched & ~evidence, certain, touched, settings.margin)
 
 
 def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: _Before, settings: MaskSettings) -> np.ndarray:
@@ -332,11 +372,13 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
     return np.any([fill_polygon(p, view.camera.width, view.camera.height) for p in view.polygons], axis=0)
 
 
-def _view_masks(before: _Before, after: _After, needed: np.ndarray, mode: str, settings: MaskSettings) -> ViewMasks:
+def _view_masks(
+    before: _Before, after: _After, needed: np.ndarray, consistent: bool, settings: MaskSettings
+) -> ViewMasks:
     silhouette = after.weight > settings.changed
-    occluder = _in_front(before.depth, after.weight > 0.5, settings)
-    target = needed if mode == "paper" else _tidy(needed, silhouette, settings.margin)
-    target, depth = target & ~occluder, before.depth
+    occluder = _in_front(before.depth, after.weight > 0.5, settings) & consistent  # else depths say nothing
+    beside = cv2.dilate(occluder.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # there T must not outgrow the object
+    target, depth = needed & ~occluder & (silhouette | ~beside), before.depth
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(
@@ -345,20 +387,29 @@ def _view_masks(before: _Before, after: _After, needed: np.ndarray, mode: str, s
 
 
 def _in_front(depth: np.ndarray, object_: np.ndarray, settings: MaskSettings) -> np.ndarray:
-    """[H, W] bool: pixels at the object's outline whose first surface lies clearly in front of it, and their rim."""
-    size = 2 * settings.margin + 1
-    object_depth = np.where(object_ & (depth > 0), depth, np.inf).astype(np.float32)
-    nearest = cv2.erode(
-        object_depth, np.ones((size, size)), borderType=cv2.BORDER_REPLICATE
-    )  # its own border is finite
-    front = ~object_ & (depth > 0) & (depth < (1 - settings.occluder_step) * np.where(np.isfinite(nearest), nearest, 0))
-    return cv2.dilate(front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    """[H, W] bool: surface at the object's outline behind whose continuation the object lies, and a pixel round it.
+
+    The continuation is a plane in disparity, level where the surface falls off on its other side. The floor before the
+    object's foot rises to it and is not in front, however flat the view; a thin rod is, close as it may stand.
+    """
+    reach = max(1, settings.margin)
+    disparity = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    padded = np.pad(disparity, reach, "reflect", reflect_type="odd")  # slopes go on beyond the frame
+    there = np.pad(object_ & (depth > 0), reach)
+    (h, w), front = depth.shape, np.zeros_like(object_)
+    for dy, dx in ((dy, dx) for dy in (-reach, 0, reach) for dx in (-reach, 0, reach) if dy or dx):
+        ahead = np.s_[reach + dy : reach + dy + h, reach + dx : reach + dx + w]
+        behind = np.s_[reach - dy : reach - dy + h, reach - dx : reach - dx + w]
+        continued = np.minimum(disparity, 2 * disparity - padded[behind])
+        front |= there[ahead] & (padded[ahead] < (1 - settings.occluder_step) * continued)
+    return cv2.dilate((front & ~object_).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _continues_outside(
     depth: np.ndarray,  # [H, W] z without the object, 0 = nothing
     alpha: np.ndarray,  # [H, W]
     touched: np.ndarray,  # [H, W] bool, by the object
+    distance: float,  # of the object, beyond which steps are of disparity, as for Sight
     settings: MaskSettings,
 ) -> np.ndarray:
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
@@ -371,7 +422,8 @@ def _continues_outside(
     index = np.arange(z.size).reshape(z.shape)
     pairs = []
     for near, far in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        close = np.abs(z[near] - z[far]) < settings.layer_step * np.minimum(z[near], z[far])
+        low, high = np.minimum(z[near], z[far]), np.maximum(z[near], z[far])
+        close = high - low < settings.layer_step * low * np.maximum(1, high / distance)
         same = there[near] & there[far] & np.where(void[near], void[far], close & ~void[far])
         pairs.append(np.stack([index[near][same], index[far][same]]))
     a, b = np.concatenate(pairs, axis=1)
@@ -399,11 +451,17 @@ def sees(
     return result
 
 
-def _tidy(target: np.ndarray, allowed: np.ndarray, margin: int) -> np.ndarray:
-    """Close pinholes, drop single pixels, and grow by a margin within what the object touched."""
+def _tidy(
+    target: np.ndarray,  # [H, W] bool
+    certain: np.ndarray,  # [H, W] bool, where thin parts are no noise
+    allowed: np.ndarray,  # [H, W] bool, what the object touched
+    margin: int,
+) -> np.ndarray:
+    """Close pinholes, drop thin parts that are not certain, and grow by a margin within what the object touched."""
     kernel = np.ones((3, 3), np.uint8)
     solid = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    if margin:
-        solid = cv2.dilate(solid, kernel, iterations=margin)
-    return (solid > 0) & cv2.dilate(allowed.astype(np.uint8), kernel).astype(bool)
+    grown = cv2.dilate(solid, kernel, iterations=margin)
+    thin = target & certain & (grown == 0)
+    grown |= cv2.dilate(thin.astype(np.uint8), kernel, iterations=margin)
+    return (grown > 0) & cv2.dilate(allowed.astype(np.uint8), kernel).astype(bool)

@@ -18,7 +18,7 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
-from ..solvers.colours import NO_CHANGE, ColourChange, learn_change
+from ..solvers.colours import NO_CHANGE, ColourChange, exposure_gain, learn_change
 from ..solvers.poisson import solve_poisson
 from ..threads import parallel_map, run_ranges
 
@@ -551,7 +551,7 @@ def _lend(mapped: _Map, view: ViewToPaint, settings: PropagateSettings) -> _Lent
     if seen.any():
         colours[seen] = _remap(view.image, x, y)
     before = mapped.reference.image[mapped.source_rows, mapped.source_cols][seen]
-    return _Lent(camera, colours, seen, _gain(before, colours[seen]))
+    return _Lent(camera, colours, seen, exposure_gain(before, colours[seen]))
 
 
 def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -561,17 +561,6 @@ def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         for k in range(0, len(x), 32000)
     ]
     return np.concatenate(parts)
-
-
-def _gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """[3] exposure of the second colours over the first ones', by well exposed pairs; 1 where there are few."""
-    gain = np.ones(3)
-    for channel in range(3):
-        a, b = before[:, channel].astype(np.float64), after[:, channel]
-        exposed = (a > 16) & (b > 16) & (a < 250) & (b < 250)
-        if exposed.sum() >= 50:
-            gain[channel] = np.median(b[exposed] / a[exposed])
-    return gain
 
 
 def blend_rim(

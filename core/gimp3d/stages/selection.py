@@ -46,7 +46,8 @@ class SelectionSettings:
     large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
     shown: float = 0.5  # weight below which a Gaussian shows nothing
     support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
-    least_object: float = 0.002  # share of the region's outline that the object fills in some view, else all goes
+    least_object: float = 0.002  # share of the region's outline that an object fills in some view to stand in a box
+    least_cells: float = 4.0  # of the surroundings along a box; in coarser ones its centre decides of a Gaussian
     near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
     least_misfit: float = 0.1  # … and by so much, colours in [0, 1]
@@ -148,6 +149,53 @@ def object_and_rim(
     width = max(1, round(camera.fx * settings.rim * cell / distance))
     grown = cv2.dilate(found, np.ones((2 * width + 1,) * 2, np.uint8))
     return found > 0, grown > found
+
+
+def boxes_of(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z of the object alone
+    region: Region,
+    surroundings: Sequence[Surroundings],
+    settings: SelectionSettings = SelectionSettings(),
+) -> np.ndarray:
+    """[M, B] bool: the boxes in which each of the object's pixels lies, or just outside."""
+    _, _, points = surface_points(camera, depth, (slice(0, camera.height), slice(0, camera.width)))
+    slack = 2 * settings.slack * max(part.cell for part in surroundings)
+    return np.stack([replace(b, size=b.size + slack).contains(points) for b in region], axis=1)
+
+
+def standing(
+    members: Sequence[np.ndarray],  # [M, B] bool of each view, see boxes_of
+    outlines: Sequence[int],  # pixels of the region in each view
+    least: float,  # share of them
+) -> list[bool]:
+    """Which boxes something stands in: greedily those that hold most of it, as long as they add enough in some view.
+
+    A box round a shadow also holds the object's foot; that is the object's box's already.
+    """
+    found = [False] * members[0].shape[1]
+    left = list(members)
+    while True:
+        counts = np.array([m.sum(0) for m in left])
+        enough = (counts > least * np.array(outlines)[:, None]).any(0)
+        if not enough.any():
+            return found
+        best = int(np.argmax(np.where(enough, counts.sum(0), -1)))
+        found[best] = True
+        left = [m[~m[:, best]] for m in left]
+
+
+def surface_in(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z, 0 = nothing
+    region: Region,
+) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface lies in the region."""
+    found = np.zeros(depth.shape, bool)
+    for box in region:
+        rows, cols, points = surface_points(camera, depth, box_window(box, camera))
+        found[rows, cols] |= box.contains(points)
+    return found
 
 
 def weigh(gaussians: Gaussians, sightings: Sequence[Sighting]) -> Weights:

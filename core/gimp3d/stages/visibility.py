@@ -16,13 +16,14 @@ from ..threads import parallel_map, run_ranges
 from .outline import Window, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
+HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
 
 
 @dataclass(frozen=True)
 class Sight:
     """How far every pixel of every view sees past the object."""
 
-    cameras: np.ndarray  # [V, 18] float64: rotation, translation, fx, fy, cx, cy, width, height
+    cameras: np.ndarray  # [V, 19] float64: rotation, translation, fx, fy, cx, cy, width, height, distance of the centre
     starts: np.ndarray  # [V] int64, a view's first pixel
     limits: np.ndarray  # float32, z of the first surface of every pixel; HIDDEN where there is none
 
@@ -30,21 +31,32 @@ class Sight:
     def make(
         cls,
         views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, untrusted pixels)
+        centre: np.ndarray,  # [3] of the object, scene coordinates
     ) -> Sight:
         """From depth maps [H, W], 0 = nothing, and masks [H, W] bool of the object and of what else hides the scene."""
         order = [views[k] for k in _spread_order(len(views))]
-        packed = [np.concatenate([c.R.ravel(), c.t, [c.fx, c.fy, c.cx, c.cy, c.width, c.height]]) for c, _, _ in order]
+        away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
+        packed = [
+            np.concatenate([c.R.ravel(), c.t, [c.fx, c.fy, c.cx, c.cy, c.width, c.height, far]])
+            for (c, _, _), far in zip(order, away)
+        ]
         limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
 
-    def shows(
+    def of(
         self,
         points: np.ndarray,  # [N, 3] scene coordinates
-        tolerance: float,  # relative z
+        tolerance: float,  # relative z, up to the centre's distance; beyond it, of disparity times that distance
     ) -> np.ndarray:
-        """[N] bool: the point is the first surface of some view, which is not hidden there."""
-        found = np.zeros(len(points), bool)
+        """[N] uint8: SHOWN if the point is the first surface of some view, which is not hidden there; SEEN_PAST if it
+        is not, and some view sees a surface behind it; BURIED if it lies behind surfaces in most views, so that it is
+        on none; else HIDES: the object alone hides it.
+
+        What is far away moves little between views, so depths there are little certain, and need not be: a sky's splats
+        lie anywhere. A difference of disparity shifts pixels by the same amount at every distance.
+        """
+        found = np.zeros(len(points), np.uint8)
         arrays = np.ascontiguousarray(points, np.float64), self.cameras, self.starts, self.limits
         run_ranges(_find_view, len(points), *arrays, float(tolerance), found)
         return found
@@ -92,9 +104,10 @@ def _spread_order(count: int) -> list[int]:
 
 @exact_kernel
 def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
-    """found[i] for i in [lo, hi): views are asked in turn until one sees the point."""
+    """found[i] for i in [lo, hi): views are asked in turn until one shows the point."""
     for i in range(lo, hi):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        hidden = 0  # views in which the object hides the point, less those in which a surface does
         for v in range(len(cameras)):
             c = cameras[v]
             depth = c[6] * x + c[7] * y + c[8] * z + c[11]
@@ -105,6 +118,11 @@ def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
             if not (0 <= col < c[16] and 0 <= row < c[17]):
                 continue
             limit = limits[starts[v] + int(row) * int(c[16]) + int(col)]
-            if abs(depth - limit) <= tolerance * depth:
-                found[i] = True
+            if abs(depth - limit) <= tolerance * depth * max(1.0, limit / c[18]):
+                found[i] = SHOWN
                 break
+            if limit > depth:
+                found[i] = SEEN_PAST
+            hidden += 1 if limit == HIDDEN else -1
+        if found[i] == HIDES and hidden < 0:
+            found[i] = BURIED

@@ -7,6 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx_files import Shape, combined, model, pixelwise
 
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.io.images import write_png
@@ -121,9 +124,10 @@ def test_an_empty_hole_is_a_no_op_and_a_full_one_is_refused(spec: str) -> None:
         inpaint_reference(spec, picture, ~none)
 
 
-@pytest.mark.parametrize("spec", ["", "lama", "exemplar:3", "file", "file:", "command:", "onnx:lama.onnx"])
+@pytest.mark.parametrize("spec", ["", "lama", "exemplar:3", "file", "file:", "command:", "onnx:"])
 def test_unknown_providers_are_refused_with_the_choices(spec: str) -> None:
-    refuse("exemplar, telea, ns, shiftmap, file:PATH or command:CMD", spec, scenery(), disc())
+    choices = "exemplar, telea, ns, shiftmap, fsr, file:PATH, onnx:PATH or command:CMD"
+    refuse(choices, spec, scenery(), disc())
 
 
 # exemplar
@@ -143,14 +147,20 @@ def test_exemplar_keeps_the_contrast_of_the_texture() -> None:
     assert filled[inner].std() > 0.7 * picture[~hole].std()
 
 
-def test_exemplar_depends_on_the_seed_and_not_on_the_thread_count() -> None:
+@pytest.mark.parametrize("guided", [False, True])
+def test_exemplar_depends_on_the_seed_and_not_on_the_thread_count(guided: bool) -> None:
     picture, hole = scenery(), disc()
+    disparity = np.linspace(0.2, 0.5, 120, dtype=np.float32)[:, None].repeat(160, 1) if guided else None
+
+    def fill(seed: int) -> np.ndarray:
+        return inpaint_reference("exemplar", holed(picture, hole), hole, seed, disparity, K).image
+
     fills = []
     for threads in (1, 2, 4):
         set_thread_count(threads)
-        fills.append(inpaint_reference("exemplar", holed(picture, hole), hole, seed=1).image)
+        fills.append(fill(1))
     assert (fills[0] == fills[1]).all() and (fills[0] == fills[2]).all()
-    assert (inpaint_reference("exemplar", holed(picture, hole), hole, seed=2).image != fills[0]).any()
+    assert (fill(2) != fills[0]).any()
 
 
 def test_exemplar_fills_holes_at_the_border_with_islands_and_in_many_parts() -> None:
@@ -169,6 +179,130 @@ def test_exemplar_interpolates_where_only_thin_lines_are_known() -> None:
     hole[::8] = False
     filled = inpaint_reference("exemplar", holed(picture, hole), hole)
     assert error(filled.image, picture, hole) < 2
+
+
+# exemplar, along surfaces
+
+K = np.array([[200.0, 0, 100], [0, 200, 40], [0, 0, 1]])
+
+
+def floor(height: int = 150, width: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles on a plane below the camera, and its disparity: they shrink with distance."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    disparity = np.maximum((y - K[1, 2]) / K[1, 1], 0)  # 1 under the camera
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (x - K[0, 2]) / K[0, 0] / disparity, 1 / disparity
+        tiles = np.tanh(4 * np.sin(12 * a + 6 * b) * np.sin(6 * a - 12 * b))
+    grey = np.where(disparity > 0.15, 128 + 80 * tiles, 220)
+    return np.repeat(grey[..., None], 3, 2).astype(np.uint8), disparity.astype(np.float32)
+
+
+def test_a_surface_makes_textures_shrink_with_distance() -> None:
+    picture, disparity = floor()
+    y, x = np.mgrid[:150, :200]
+    hole = (x - 100) ** 2 / 1.5 + (y - 115) ** 2 < 22**2
+    base = holed(picture, hole)
+    flat = inpaint_reference("exemplar", base, hole).image
+    guided = inpaint_reference("exemplar", base, hole, disparity=disparity, K=K)
+    assert error(guided.image, picture, hole) < 0.4 * error(flat, picture, hole)
+    assert "surfaces" in guided.reason
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0, 1e-9, 1e9])
+def test_surfaces_without_sense_still_give_a_fill(value: float) -> None:
+    picture, hole = scenery(), disc()
+    disparity = np.full(hole.shape, value, np.float32)
+    done = inpaint_reference("exemplar", holed(picture, hole), hole, disparity=disparity, K=K)
+    assert (done.image[~hole] == picture[~hole]).all()
+    assert error(done.image, picture, hole) < 60
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(6, 40), st.integers(6, 40), st.booleans(), st.floats(0.02, 0.98))
+def test_any_hole_is_filled_with_colours_that_the_picture_may_hold(
+    seed: int, height: int, width: int, guided: bool, share: float
+) -> None:
+    random = np.random.default_rng(seed)
+    picture = random.integers(60, 200, (height, width, 3)).astype(np.uint8)
+    hole = cv2.GaussianBlur(random.random((height, width)), (0, 0), 1.5)
+    hole = hole > np.quantile(hole, share)
+    if hole.all():
+        hole[0, 0] = False
+    disparity = random.uniform(0.1, 1, hole.shape).astype(np.float32) if guided else None
+    done = inpaint_reference("exemplar", picture, hole, seed % 7, disparity, K)
+    assert (done.image[~hole] == picture[~hole]).all()
+    again = inpaint_reference("exemplar", np.where(hole[..., None], np.uint8(3), picture), hole, seed % 7, disparity, K)
+    assert (done.image == again.image).all()
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_a_constant_picture_stays_constant(guided: bool) -> None:
+    picture, hole = np.full((90, 120, 3), (40, 90, 200), np.uint8), disc(90, 120)
+    disparity = np.full(hole.shape, 0.5, np.float32) if guided else None
+    assert (inpaint_reference("exemplar", holed(picture, hole), hole, disparity=disparity, K=K).image == picture).all()
+
+
+# onnx: a network that paints what the mask marks in one colour
+
+PAINT = np.array([[0.8], [0.2], [0.1]])
+
+
+def painter(order: tuple[str, str] = ("image", "mask"), size: Shape = ("h", "w"), scale: float = 1) -> bytes:
+    shapes: dict[str, Shape] = {"image": (1, 3, *size), "mask": (1, 1, *size)}
+    nodes = [
+        pixelwise("image", "kept", scale * np.eye(3)),
+        pixelwise("mask", "paint", scale * PAINT),
+        combined("Add", ["kept", "paint"], "y"),
+    ]
+    return model(nodes, {name: shapes[name] for name in order}, (1, 3, *size))
+
+
+def painter_of_four_channels(size: Shape = ("h", "w")) -> bytes:
+    return model([pixelwise("x", "y", np.hstack([np.eye(3), PAINT]))], {"x": (1, 4, *size)}, (1, 3, *size))
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        painter(),
+        painter(("mask", "image")),
+        painter(size=(96, 128)),
+        painter(scale=255),
+        painter_of_four_channels(),
+        painter_of_four_channels((64, 64)),
+    ],
+    ids=["any size", "mask first", "fixed size", "0 to 255", "4 channels", "4 channels, fixed"],
+)
+@pytest.mark.parametrize("asked", ["", ",160x120"])
+def test_a_model_paints_the_hole(tmp_path: Path, network: bytes, asked: str) -> None:
+    (tmp_path / "a, b.onnx").write_bytes(network)
+    picture, hole = scenery(), disc()
+    done = inpaint_reference(f"onnx:{tmp_path}/a, b.onnx{asked}", holed(picture, hole), hole)
+    inner = cv2.erode(hole.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert np.abs(done.image[inner].astype(int) - np.rint(255 * PAINT[:, 0])).max() <= 2
+    assert (done.image[~hole] == picture[~hole]).all()
+
+
+def test_models_that_cannot_paint_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "m.onnx"
+    no_mask = model([pixelwise("x", "y", np.eye(3))], {"x": (1, 3, 64, 64)}, (1, 3, 64, 64))
+    one_channel = model([pixelwise("x", "y", np.ones((1, 4)))], {"x": (1, 4, 64, 64)}, (1, 1, 64, 64))
+    inverted = model([pixelwise("x", "y", -np.eye(3, 4))], {"x": (1, 4, 64, 64)}, (1, 3, 64, 64))
+    unknown = model([pixelwise("x", "y", np.eye(3, 4), "NoSuchThing")], {"x": (1, 4, 64, 64)}, (1, 3, 64, 64))
+    cases = {
+        "cannot read": None,
+        "not an ONNX model": b"nothing at all, only words",
+        "picture of 3 channels and a mask of 1": no_mask,
+        "no finite picture": one_channel,
+        "does not match the view": inverted,
+        "OpenCV cannot run": unknown,
+    }
+    for words, data in cases.items():
+        path.unlink(missing_ok=True)
+        if data is not None:
+            path.write_bytes(data)
+        refuse(words, f"onnx:{path}", scenery(), disc())
+    assert capfd.readouterr().err == ""
 
 
 # file

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import struct
-
 import cv2
 import numpy as np
 import pytest
+from onnx_files import model, pixelwise
 
 from gimp3d.errors import BadInput
 from gimp3d.priors.monodepth import (
@@ -17,6 +16,7 @@ from gimp3d.priors.monodepth import (
     depth_prior,
     relative_disparity,
 )
+from gimp3d.priors.onnx import read_model
 
 
 def test_the_scene_alone_decides_without_a_file():
@@ -115,35 +115,12 @@ def test_what_the_fit_sends_behind_the_camera_has_no_value():
     assert np.isnan(found[15, 30]) and np.isfinite(found[KNOWN]).all()
 
 
-# Networks: ONNX files written field by field (protocol buffers), since the package `onnx` is no dependency
-
-
-def varint(value):
-    return bytes([value & 127 | 128 * (value > 127)]) + (varint(value >> 7) if value > 127 else b"")
-
-
-def field(number, value):
-    if isinstance(value, int):
-        return varint(number << 3) + varint(value)
-    data = value.encode() if isinstance(value, str) else value
-    return varint(number << 3 | 2) + varint(len(data)) + data
-
-
-def value_info(name, shape):
-    dims = b"".join(field(1, field(1, n) if isinstance(n, int) else field(2, n)) for n in shape)
-    return field(1, name) + field(2, field(1, field(1, 1) + field(2, dims)))
+# Networks
 
 
 def network(height="h", width="w", weights=(0.2, 0.3, 0.5), operator="Conv", output=("h", "w")):
     """A 1×1 convolution: one channel, a weighted sum of the normalised picture's."""
-    tensor = b"".join(field(1, n) for n in (1, 3, 1, 1)) + field(2, 1) + field(8, "k")
-    tensor += field(9, struct.pack("<3f", *weights))
-    kernel = field(1, "kernel_shape") + field(20, 7) + field(8, 1) + field(8, 1)
-    node = field(1, "x") + field(1, "k") + field(2, "y") + field(4, operator) + field(5, kernel)
-    graph = field(1, node) + field(2, "g") + field(5, tensor)
-    graph += field(11, value_info("k", (1, 3, 1, 1))) + field(11, value_info("x", (1, 3, height, width)))
-    graph += field(12, value_info("y", (1, 1, *output)))
-    return field(1, 8) + field(7, graph) + field(8, field(1, "") + field(2, 13))
+    return model([pixelwise("x", "y", np.array([weights]), operator)], {"x": (1, 3, height, width)}, (1, 1, *output))
 
 
 def picture(height, width):
@@ -167,7 +144,7 @@ def test_a_model_sees_the_normalised_picture_in_its_own_size(tmp_path, height, w
     assert found.kind == (kind[1:] or "disparity") and found.values.shape == (90, 120)
     wanted = answer(image)
     assert np.abs(found.values - wanted)[3:-3, 3:-3].mean() < 0.02 * np.ptp(wanted)
-    assert declared_size(path.read_bytes()) == (None if height == "h" else size)
+    assert declared_size(read_model("--depth-prior", path)) == (None if height == "h" else size)
 
 
 def test_a_model_that_predicts_disparity_guides_the_completion(tmp_path):

@@ -215,6 +215,19 @@ def test_guidance_is_hardly_ever_worse_than_none():
     assert np.mean(worse) <= 0.03
 
 
+def test_planes_are_not_given_up_for_a_prior_that_tells_them_worse():
+    """A step's prior correlates with it, however wrong it is elsewhere: 15 % of the range here."""
+    hole = blob()
+    for seed in range(3):
+        _, scene, prior = random_case(seed, "step", 0.15)
+        truth = random_case(seed, "step", 0)[0]
+        guided, none = (complete_disparity(scene, ~hole, hole, p) for p in (prior, None))
+        as_measured = complete_disparity(scene, ~hole, hole, prior, DepthSettings(prior_miss=1e9))
+        off, off_none, off_measured = (relative_error(x, truth, hole).mean() for x in (guided, none, as_measured))
+        assert guided.scale_factor > 0 and "prior believed by" in guided.reason
+        assert off < 1.1 * off_none and off < 0.5 * off_measured
+
+
 def test_the_pairs_behind_the_scale_factor_come_with_it():
     truth, _, prior = random_case(4, "terrain", 0)
     found = complete(truth, blob(), prior)

@@ -43,6 +43,16 @@ def test_the_target_covers_the_hole_and_little_more() -> None:
         assert not view.target[true == 0].any() or view.target[true == 0].sum() < 0.1 * view.target.sum()
 
 
+@pytest.mark.parametrize("zoom", [0.1, 0.3, 0.5])
+def test_holes_of_a_few_pixels_are_in_the_target(zoom: float) -> None:
+    """Rows of the floor under the block, one to four pixels high in the views from low down."""
+    views = [replace(c, fx=zoom * c.fx, fy=zoom * c.fy) for c in cameras()]
+    found = find_masks(scene(), REGION, views).views
+    hidden = [hidden_floor(v.camera) for v in found]
+    assert min(h.sum() for h in hidden) < 25 and all(h.any() for h in hidden)
+    assert sum((v.target & h).sum() for v, h in zip(found, hidden)) > 0.97 * sum(h.sum() for h in hidden)
+
+
 def test_need_is_smaller_than_paper_and_both_lie_where_the_object_was() -> None:
     need = find_masks(scene(), REGION, cameras())
     paper = find_masks(scene(), REGION, cameras(), MaskSettings(mode="paper"))

@@ -14,9 +14,9 @@ from scipy.special import ndtr
 from gimp3d.box import Box, Region
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
-from gimp3d.raster import render
+from gimp3d.raster import render, surface_depth
 from gimp3d.stages.masks import Masks, MaskSettings, find_masks
-from gimp3d.stages.selection import Fate, SelectionSettings, mass_inside, select_removed
+from gimp3d.stages.selection import Fate, SelectionSettings, mass_inside, select_removed, standing
 
 DEEP = (Box.make([0, 0, 0.2], [0.9, 0.9, 0.72]),)  # cuts 16 cm into the floor, a hand's width round the block
 VIEWS = cameras(12, 200, 150)
@@ -181,3 +181,29 @@ def test_overlapping_boxes_are_their_union() -> None:
     assert (select_removed(scene(), halves) == select_removed(scene(), DEEP)).all()
     one, two = found(scene()).removed, found(scene(), halves).removed
     assert two[FLOOR:].all() and (one != two).mean() < 0.01
+
+
+def test_the_objects_foot_in_a_shadows_box_makes_it_no_object() -> None:
+    foot, body, other = [True, True, False], [True, False, False], [False, False, True]
+    views = [np.array([foot] * 30 + [body] * 50), np.array([foot] * 5 + [body] * 90 + [other] * 3)]
+    assert standing(views, [1000, 1000], 0.002) == [True, False, True]
+    assert standing(views, [1000, 2000], 0.002) == [True, False, False]  # three pixels of 2000 are too few
+    assert standing([np.array([foot] * 9)], [1000], 0.002) == [True, False, False]  # of equal boxes one is enough
+    assert standing([np.zeros((0, 3), bool)], [1000], 0.002) == [False] * 3
+
+
+def test_a_box_round_a_shadow_takes_its_floor_and_masks_it() -> None:
+    """It cuts into the block's foot and lies half outside the block's box."""
+    box = Box.make([0.45, 0, 0], [0.5, 0.4, 0.1])
+    masks = find_masks(scene(), (*DEEP, box), VIEWS)
+    alone = box.contains(scene().means) & ~DEEP[0].contains(scene().means)
+    assert alone[:FLOOR].sum() > 50 and masks.removed[alone].all()
+    shown = 0  # in some views the block hides it all
+    for view in masks.views:
+        depth, _ = surface_depth(scene(), view.camera)
+        points = view.camera.unproject(view.camera.pixel_centres(), depth.astype(float)).reshape(-1, 3)
+        named = (box.contains(points) & ~DEEP[0].contains(points)).reshape(depth.shape) & (depth > 0)
+        shown += named.sum()
+        assert view.target[named].all()
+        assert not view.depth_before[named].any()  # its photos are no evidence
+    assert shown > 1000

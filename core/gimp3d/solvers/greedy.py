@@ -1,0 +1,144 @@
+"""A first guess for a hole: it is filled from its rim inwards, each time where most around is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import float32, int64
+
+from ..jit import kernel
+from ..raster.vec16 import fma16, load16, splat16, sum16
+from .patches import lay_out
+from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
+
+MOST_SOURCES = 4096  # patches that are tried for each place
+NO_SUPPORT = np.empty((0, 0), np.uint8)
+LEAST_SHARE = 1e-6  # what was copied without anything known around
+STAMP = 1  # px: half the square that is copied at once
+
+
+def fill_inwards(
+    channels: np.ndarray,  # [H, W, C] float32
+    hole: np.ndarray,  # [H, W] bool
+    allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
+    radius: int,
+    surface: Surface | None = None,  # copy along its tangent planes
+    usable: np.ndarray | None = None,  # [H, W] bool, what may be copied then
+) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.
+
+    The next place is the one with most known around it; what was copied counts as less known the further from
+    the rim it lies (confidence of Criminisi 2004). The source is the patch that differs least from what is
+    known of the place's own.
+    """
+    patches = lay_out(channels, radius)
+    rows, cols = np.nonzero(allowed)
+    thinned = slice(None, None, -(-len(rows) // MOST_SOURCES))
+    known = np.pad((~hole).astype(np.float32), radius)
+    found_rows, found_cols = np.full((2, *hole.shape), -1, np.int32)
+    share = cv2.blur(known, (2 * radius + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
+    places = np.argwhere(hole)
+    number, support = np.full(hole.shape, -1), NO_SUPPORT
+    if surface is not None:
+        number[hole] = np.arange(len(places))
+        support = supports(surface, places, radius)
+    _fill_inwards(
+        *patches, places, rows[thinned], cols[thinned], ~hole if usable is None else usable, known, share,
+        surface is not None, *(surface or NO_SURFACE), support, number, found_rows, found_cols,
+    )  # fmt: skip
+    return found_rows, found_cols
+
+
+@kernel
+def _fill_inwards(
+    values, stride, channels, radius, row_weights, places, source_rows, source_cols, usable, known, share,
+    slanted, point, normal, frame, inverse, plane, clear, support, number, rows, cols,
+):  # fmt: skip
+    """`known` and `share` are [H + 2 radius, W + 2 radius]: a pixel's confidence and its mean over the patch."""
+    h, w = rows.shape
+    size, width = 2 * radius + 1, len(row_weights)
+    weights = np.empty(size * width, np.float32)
+    left = len(places)
+    while left > 0:
+        best_share, y, x = float32(-1), -1, -1
+        for k in range(len(places)):
+            a, b = places[k]
+            if rows[a, b] < 0 and share[a + radius, b + radius] > best_share:
+                best_share, y, x = share[a + radius, b + radius], a, b
+        if slanted:  # only what lies on the place's own surface counts as known
+            counted = float32(0)
+            for i in range(size * size):
+                if support[number[y, x], i] != 0:
+                    counted += known[y + i // size, x + i % size]
+            counted /= size * size
+            if counted < 0.999 * best_share:
+                share[y + radius, x + radius] = counted
+                continue
+        for i in range(size):
+            for j in range(width):
+                there = j < size * channels and known[y + i, x + j // channels] > 0
+                if there and slanted:
+                    there = support[number[y, x], i * size + j // channels] != 0
+                weights[i * width + j] = float32(1) if there else float32(0)
+        least, best_v, best_u = float32(1e30), source_rows[0], source_cols[0]
+        for k in range(len(source_rows)):
+            v, u = source_rows[k], source_cols[k]
+            one, other = y * stride + x * channels, v * stride + u * channels
+            if slanted:
+                distance = float32(0)
+                xx = frame[v, u, 0] * inverse[y, x, 0] + frame[v, u, 1] * inverse[y, x, 2]
+                xy = frame[v, u, 0] * inverse[y, x, 1] + frame[v, u, 1] * inverse[y, x, 3]
+                yx = frame[v, u, 2] * inverse[y, x, 0] + frame[v, u, 3] * inverse[y, x, 2]
+                yy = frame[v, u, 2] * inverse[y, x, 1] + frame[v, u, 3] * inverse[y, x, 3]
+                areas = xx * yy - xy * yx
+                if areas < SCALES[0] or areas > SCALES[1]:
+                    continue
+                off = float32(0)
+                for c in range(3):
+                    distance += NORMAL * (normal[y, x, c] - normal[v, u, c]) ** 2
+                    off += normal[y, x, c] * (point[v, u, c] - point[y, x, c])
+                off /= point[y, x, 2]
+                distance = size * size * channels * (distance + min(OFF_PLANE * off * off, FURTHEST_OFF))
+                for i in range(size * size):
+                    dy, dx = i // size - radius, i % size - radius
+                    if weights[i // size * width + i % size * channels] == 0:
+                        continue
+                    a = v + int64(np.floor(yx * dx + yy * dy + float32(0.5)))
+                    b = u + int64(np.floor(xx * dx + xy * dy + float32(0.5)))
+                    if a < 0 or b < 0 or a >= h or b >= w or not usable[a, b]:
+                        distance = float32(1e30)
+                    if distance >= least:
+                        break
+                    one = (y + dy + radius) * stride + (x + dx + radius) * channels
+                    other = (a + radius) * stride + (b + radius) * channels
+                    for c in range(channels):
+                        distance += (values[one + c] - values[other + c]) ** 2
+            else:
+                total = splat16(float32(0))
+                for i in range(size):
+                    for j in range(0, width, 16):
+                        difference = load16(values, one + j) - load16(values, other + j)
+                        total = fma16(difference * load16(weights, i * width + j), difference, total)
+                    one += stride
+                    other += stride
+                distance = sum16(total)
+            if distance < least:
+                least, best_v, best_u = distance, v, u
+        reach = min(STAMP, radius)
+        for a in range(max(0, y - reach), min(h, y + reach + 1)):
+            for b in range(max(0, x - reach), min(w, x + reach + 1)):
+                if known[a + radius, b + radius] > 0:
+                    continue
+                q, p = best_v + a - y, best_u + b - x
+                if slanted and not (0 <= q < h and 0 <= p < w and usable[q, p]):
+                    q, p = best_v, best_u
+                rows[a, b], cols[a, b] = q, p
+                left -= 1
+                one = (a + radius) * stride + (b + radius) * channels
+                other = (q + radius) * stride + (p + radius) * channels
+                for c in range(channels):
+                    values[one + c] = values[other + c]
+                known[a + radius, b + radius] = max(best_share, LEAST_SHARE)
+                for i in range(size):
+                    for j in range(size):
+                        share[a + i, b + j] += max(best_share, LEAST_SHARE) / (size * size)

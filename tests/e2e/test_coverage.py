@@ -1,0 +1,47 @@
+"""No part of a hole is left open silently, whatever the preset."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from scenes import REGION, cameras, scene
+
+from gimp3d import pipeline
+from gimp3d.errors import IllPosed
+from gimp3d.evaluate.benchmark import run_benchmark
+from gimp3d.pipeline import RemovalSettings, View, remove_object, render_bytes
+
+
+def views() -> list[View]:
+    return [View(c, render_bytes(scene(), c)) for c in cameras()]
+
+
+def test_what_stays_open_is_counted_and_said() -> None:
+    first, *others = cameras()
+    cut = replace(first, cx=first.cx - 60)  # shows half of the hole
+    seen = [View(c, render_bytes(scene(), c)) for c in (cut, *others)]
+    done = remove_object(scene(), seen, REGION, RemovalSettings(extra_references=0), reference=cut.id)
+    assert done.open_pixels > 0.1 * done.hole_pixels
+    assert any(f"({done.open_pixels})" in w and "stay open" in w for w in done.warnings)
+
+
+def test_a_negligible_hole_that_no_view_can_fill_does_not_stop_a_removal(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*_: object) -> None:
+        raise IllPosed("no view shows it")
+
+    monkeypatch.setattr(pipeline, "choose_reference", none)
+    with pytest.raises(IllPosed, match="no view shows it"):
+        remove_object(scene(), views(), REGION)
+    monkeypatch.setattr(pipeline, "NEGLIGIBLE", 1.0)
+    done = remove_object(scene(), views(), REGION)
+    assert done.added is None and not done.keep.all() and done.open_pixels == done.hole_pixels > 0
+    assert any("no view shows it" in w for w in done.warnings) and any("stay open" in w for w in done.warnings)
+
+
+@pytest.mark.slow
+def test_the_draft_preset_leaves_no_black_hole(shared_data: Path, tmp_path: Path) -> None:
+    rows = run_benchmark(shared_data / "withwithout", tmp_path, ["gloss"], ["draft"])
+    psnr = {r["method"]: r["psnr mask"] for r in rows}
+    assert psnr["draft"] > 30 > psnr["hole open"] + 5  # what one reference does not reach costs 11 dB
