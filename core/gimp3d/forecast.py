@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-ROUNDS = {"draft": 2, "balanced": 3, "best": 5}  # reference views completed, one after the other; others 1
+ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
 ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 PER_MEGAPIXEL = {"read": 0.3, "masks": 0.6, "reference": 0.2, "propagate": 0.3}  # s for each million pixels of views
 PER_STAGE = {"depth": 0.25, "appearance": 0.3, "mapping": 0.1, "seed": 0.05}  # s
