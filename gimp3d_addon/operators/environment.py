@@ -42,7 +42,7 @@ for name in ("numpy", "scipy", "numba", "cv2", "zstandard", "torch"):
 print(json.dumps({"stage": "done", "summary": found}))
 """
 NEEDED = ("numpy", "scipy", "numba", "cv2")
-USES = {"zstandard": "for newer .spz files", "torch": "only for your own scripts"}
+USES = {"zstandard": "for newer .spz files", "torch": "refines the new splats"}
 
 
 def environment_folder() -> Path:
@@ -65,7 +65,8 @@ class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
 
     torch: BoolProperty(
         name="With PyTorch",
-        description="Only for your own scripts that optimise splats; no button of 3D-GIMP needs it",
+        default=True,
+        description="Refines the new splats; without it the presets Balanced and Best leave them as Draft does",
     )
 
     @classmethod

@@ -60,7 +60,7 @@ def test_the_environment_is_made_and_used(
     monkeypatch.setattr(environment, "bpy", SimpleNamespace(app=app))
     monkeypatch.setattr(environment, "environment_folder", lambda: tmp_path / "env")
     monkeypatch.setattr(environment, "LIBRARIES", ("pip",))
-    assert bpy.ops.gimp3d.make_environment() == {"FINISHED"}
+    assert bpy.ops.gimp3d.make_environment(torch=False) == {"FINISHED"}
     assert Path(preferences.python).exists() and str(tmp_path / "env") in preferences.python
     assert environment.environment_python(tmp_path / "env") == Path(preferences.python)
 
@@ -73,7 +73,7 @@ def test_a_download_that_fails_is_said_and_changes_nothing(
     monkeypatch.setattr(environment, "environment_folder", lambda: tmp_path / "env")
     monkeypatch.setattr(environment, "LIBRARIES", (str(tmp_path / "no such folder"),))
     with pytest.raises(RuntimeError, match="gimp3d: error: "):
-        bpy.ops.gimp3d.make_environment()
+        bpy.ops.gimp3d.make_environment(torch=False)
     assert preferences.python == ""
 
 
