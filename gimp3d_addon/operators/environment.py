@@ -18,17 +18,20 @@ from .base import RunsChild, python_of
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "zstandard")
 SIZES = ("about 170 MB to download, 650 MB on disk", "about 400 MB to download, 1.5 GB on disk")
-TORCH_INDEX = "https://download.pytorch.org/whl/cpu"
+TORCH_INDEX = "https://download.pytorch.org/whl/cpu"  # PyPI's own brings 2 GB of CUDA along on Linux
 MAKE = """
 import json, subprocess, sys, venv
-folder, python, *pip = sys.argv[1:]
+folder, python, torch_index, *libraries = sys.argv[1:]
 say = lambda done, what: print(json.dumps({"stage": what, "done": done, "total": 3}), flush=True)
 say(0, "making the environment")
 venv.create(folder, with_pip=True, clear=True)
-say(1, "downloading and installing")
-done = subprocess.run([python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *pip])
-say(2, "finished")
-sys.exit(done.returncode)
+pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+say(1, "installing the libraries")
+code = subprocess.run([*pip, *libraries]).returncode
+if torch_index and not code:
+    say(2, "installing PyTorch")
+    code = subprocess.run([*pip, "torch", "--index-url", torch_index]).returncode
+sys.exit(code)
 """
 CHECK = """
 import importlib, json, sys
@@ -92,8 +95,8 @@ class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
             raise BadInput("Blender is set to stay offline; allow it in Preferences › System › Network")
         folder = environment_folder()
         self._python = environment_python(folder)
-        libraries = [*LIBRARIES, *(["torch", "--extra-index-url", TORCH_INDEX] if self.torch else [])]
-        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), *libraries])
+        index = TORCH_INDEX if self.torch else ""
+        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), index, *LIBRARIES])
 
     def collect(self, context: bpy.types.Context) -> None:
         self.worker.result()
