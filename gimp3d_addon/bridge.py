@@ -80,7 +80,9 @@ def camera_from_blender(
     if CAMERA in obj:
         stored = json.loads(obj[CAMERA])
         distortion = Distortion(*stored["distortion"]) if stored["distortion"] else None
-        there = name is None and not _moved(viewmat, np.array(stored["viewmat"]), frame)
+        imported = np.array(stored["viewmat"])
+        there = name is None and not _moved(viewmat, imported, frame)
+        viewmat = imported if there else viewmat  # to the last bit, which Blender's float32 does not keep
         image = Path(stored["image"]) if stored["image"] and there else None
         size = (stored["width"], stored["height"])
         intrinsics = (stored["fx"], stored["fy"], stored["cx"], stored["cy"])
