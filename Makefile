@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
+.PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
 	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large extension screenshots clean
 .DELETE_ON_ERROR:
 
@@ -26,6 +26,11 @@ test: $(READY)
 
 test-all: $(READY) lint
 	$(BIN)/python -m pytest
+	$(BIN)/python scripts/test_blenders.py
+
+# the add-on's tests under Blender 4.5 LTS and 5.2 LTS
+test-blenders: $(READY)
+	$(BIN)/python scripts/test_blenders.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -82,8 +87,10 @@ bench-inpaint: $(READY) $(OTHERS)/.ready
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
 
+# in a real Blender with its window, on a virtual screen: root on Debian, see scripts/screenshots.py
 screenshots: demo
 	cp build/demo/before_after.png assets/before_after.png
+	$(BIN)/python scripts/screenshots.py
 
 clean:
 	rm -rf build dist $(VENV)
