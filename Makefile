@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -32,7 +32,8 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint
+bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
+	bench-pareto
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -54,6 +55,14 @@ bench-propagate: $(READY)
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)
 	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
+
+# presets, ablations and baselines: half an hour
+bench-pareto: $(READY)
+	$(BIN)/python scripts/bench_refine.py $(DATA)
+
+# desk with every Gaussian split in ten and 200 views of 960 × 540
+bench-large: $(READY)
+	$(BIN)/python scripts/bench_large.py $(DATA)/desk
 
 # scikit-image's photographs and other programs' fills come from an environment of their own
 OTHERS := build/others

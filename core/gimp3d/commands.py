@@ -17,6 +17,7 @@ from . import __version__
 from .box import read_region
 from .camera import Camera
 from .errors import BadInput
+from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
@@ -353,6 +354,7 @@ def _summary(
             "removed": removed,
             "added": added,
             "gaussians_out": len(file.gaussians) - removed + added,
+            **_cost(file, result.added),
             "views": result.views,
             "hole_pixels": result.hole_pixels,
             "open_pixels": result.open_pixels,
@@ -363,6 +365,19 @@ def _summary(
         "warnings": [*warnings, *result.warnings],
         "peak_memory_mb": round(peak_memory_mb(), 1),
     }
+
+
+def _cost(file: SplatFile, added: Gaussians | None) -> dict[str, int]:
+    """What the new Gaussians need: bytes in the file (binary ones), and how many use which SH degree."""
+    if added is None or not len(added):
+        return {}
+    used = (added.sh != 0).any(2)
+    highest = np.ceil(np.sqrt(used.shape[1] - used[:, ::-1].argmax(1))).astype(int) - 1
+    degrees = np.where(used.any(1), highest, 0)
+    cost = {f"added_of_degree_{d}": int((degrees == d).sum()) for d in range(added.sh_degree + 1)}
+    return (
+        cost if file.table.format == "ascii" else {"added_bytes": len(added) * file.table.rows.dtype.itemsize, **cost}
+    )
 
 
 def peak_memory_mb() -> float:

@@ -44,7 +44,8 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from .stages.refine import Refinement, RefineSettings, observed, refine_gaussians, torch_is_there
+from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
 
@@ -63,6 +64,7 @@ class RemovalSettings:
     mapping: MappingSettings = MappingSettings()
     propagate: PropagateSettings = PropagateSettings()
     seed: SeedSettings = SeedSettings()
+    refine: RefineSettings = RefineSettings()
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
     use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
@@ -73,18 +75,28 @@ class RemovalSettings:
 
 PRESETS: dict[str, RemovalSettings] = {
     "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
-    "balanced": RemovalSettings(),
-    "best": RemovalSettings(extra_references=4, extra_gain=0.005),
+    "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
+    "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
+        seed=SeedSettings(
+            largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
+        ),
+        refine=RefineSettings(steps=3000, patience=120),
         use_evidence=False,
         extra_references=0,
     ),
 }
+# The paper as it is printed, as far as it can be run: the guidance's and the visibility's signs. As printed, patches
+# are not compared at p at all, and the finest level comes first: that gives no field.
+PRESETS["paper-literal"] = replace(
+    PRESETS["paper"],
+    depth=replace(PRESETS["paper"].depth, scale_factor=-0.1),
+    mapping=MappingSettings(visibility=-MappingSettings().visibility),
+)
 
 
 @dataclass(frozen=True)
@@ -222,6 +234,7 @@ def remove_object(
     del drawn
     filled, added = kept, None
     open_views = masks.views
+    told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
@@ -248,8 +261,11 @@ def remove_object(
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
+        for name, rule in rules.items():
+            told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
         painted = _redrawn(painted, filled, masks.views, open_views)
         open_views = _all_still_open(open_views, filled, len(added), rules, settings.masks)
+    added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
@@ -259,6 +275,29 @@ def remove_object(
         for name, v in ((v.camera.id, v) for v in masks.views)
     }
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
+
+
+def _refined(
+    run: _Run,
+    kept: Gaussians,
+    added: Gaussians | None,
+    masks: Masks,
+    painted: dict[str, np.ndarray],
+    told: dict[str, np.ndarray],
+    settings: RemovalSettings,
+) -> Gaussians | None:
+    """The new Gaussians, optimised where the settings ask for it and torch is there."""
+    if added is None or not settings.refine.steps:
+        return added
+    if not torch_is_there():
+        run.warnings.append("torch is not installed: the new Gaussians are not refined, as in the preset draft")
+        return added
+    views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
+    refinement: Refinement = run(
+        "refine",
+        lambda: refine_gaussians(kept, added, views, settings.refine, settings.random_seed, run.progress),
+    )
+    return refinement.gaussians
 
 
 def _fill_from_one_view(
@@ -341,7 +380,14 @@ def _fill_from_one_view(
     ]
     new: Gaussians = run(
         f"seed{suffix}",
-        lambda: colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
+        lambda: settle_gaussians(
+            filled,
+            colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
+            view.camera,
+            loaders,
+            painting.views,
+            settings.seed,
+        ),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
     return new, painting
@@ -526,4 +572,5 @@ STORED = (
     Propagation,
     PaintedView,
     Appearance,
+    Refinement,
 )

@@ -75,6 +75,11 @@ def test_remove_keeps_rows_byte_for_byte_and_fills_the_hole(scene_folder: Path, 
         "peak_memory_mb",
     }
     assert {"name", "seconds", "confidence", "reason"} <= set(summary["stages"][0])
+    assert sum(v for k, v in counts.items() if k.startswith("added_of_degree_")) == counts["added"]
+    row = (scene_folder / "scene.ply").stat().st_size // counts[
+        "gaussians_in"
+    ]  # the header is far shorter than a row each
+    assert counts["added_bytes"] == counts["added"] * row
 
 
 def test_result_does_not_depend_on_the_number_of_threads(scene_folder: Path, tmp_path: Path) -> None:
@@ -170,9 +175,10 @@ def test_extra_masks_are_filled_too(scene_folder: Path, tmp_path: Path, capsys: 
     assert "--extra-masks" in capsys.readouterr().err and not (tmp_path / "m").exists()
 
 
-@pytest.mark.parametrize("preset", ["draft", "balanced", "best", "paper"])
+@pytest.mark.parametrize("preset", ["draft", "balanced", "best", "paper", "paper-literal"])
 def test_every_preset_runs_and_its_summary_is_strict_json(preset: str, scene_folder: Path, tmp_path: Path) -> None:
-    remove(scene_folder, tmp_path / "out.ply", "--preset", preset, "--summary", str(tmp_path / "s.json"))
+    few = ("--set", "refine.steps=20") if preset.startswith("paper") else ()
+    remove(scene_folder, tmp_path / "out.ply", "--preset", preset, "--summary", str(tmp_path / "s.json"), *few)
 
     def refuse(word: str) -> None:
         raise AssertionError(f"{word} is not JSON")
@@ -306,7 +312,7 @@ BAD = {
     "setting of a wrong type": (
         [*f"{REMOVE} --set seed.opacity=much".split()], 2, "takes a float",
     ),
-    "a preset of a later version": (f"{REMOVE} --preset paper-literal".split(), 2, "not in this version"),
+    "a preset of a later version": (f"{REMOVE} --preset someday".split(), 2, "not in this version"),
     "negative seed": (f"{REMOVE} --seed -1".split(), 2, "--seed"),
     "no CUDA": ([*f"{REMOVE} --device cuda".split()], 2, "CUDA"),
     "no job there": (["remove", "--job", "nowhere"], 2, "job.json"),

@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..camera import Camera
-from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
+from ..errors import BadInput
+from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
+from ..raster import PictureGradients, RasterSettings, contributions, pixel_region
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
 from .masks import sees
-from .propagate import Loader, PaintedView, Rule
+from .propagate import Loader, PaintedView, Rule, ViewToPaint
 from .reference import surface_normals
+
+OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
+LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
 
 
 @dataclass(frozen=True)
 class SeedSettings:
-    """How a pixel of the completed reference becomes a Gaussian."""
+    """How the completed reference becomes Gaussians."""
 
-    spread: float = 0.6  # tangential standard deviation in pixel footprints
+    spread: float = 0.75  # standard deviation on screen, low-pass included, in sides of the splat's patch
+    largest: int = 4  # px, a power of two: the longest side of a patch; 1: one Gaussian per pixel (paper)
+    detail: float = 20.0  # squared grey levels × px, summed over channels: a patch whose colours vary more is halved
+    bend: float = 0.002  # RMS deviation from a plane, relative to the depth, above which a patch is halved
     maximum_slant: float = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
-    thickness: float = 0.1  # standard deviation along the normal, as a share of the tangential one
+    thickness: float = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
     opacity: float = 0.98
+    sink: float = 0.25  # depth under the surface, in standard deviations; see settle_gaussians
+    needed: float = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
+    corrections: int = 1  # steps by which c_0 is corrected so that the scene, drawn, shows the painted views
+    hold: float = 3.0  # px of blend weight by which c_0 is held at the reference's colour
+    looks: int = 12  # painted views that both of these are judged by
     sh_degree: int = 2  # the highest of new Gaussians; each gets the one that its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
@@ -39,34 +54,159 @@ def seed_gaussians(
     surfels: bool,
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
-    """One Gaussian per target pixel with a depth, of SH degree 0: back-projected, aligned with the surface."""
+    """Gaussians of SH degree 0 that tile the target: large ones where colour and surface are smooth.
+
+    The target is cut into rectangles (see `_patches`). Each becomes one Gaussian in the surface's tangent plane whose
+    picture in the reference has the rectangle's shape, so that neighbours meet without cracks at any slant.
+
+    Raises
+    ------
+    BadInput
+        If `settings.largest` is no power of two.
+    """
+    if settings.largest < 1 or settings.largest & (settings.largest - 1):
+        raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")
     normals = surface_normals(camera, depth)
-    rows, cols = np.nonzero(target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
-    z = depth[rows, cols].astype(np.float64)
-    uv = np.stack([cols + 0.5, rows + 0.5], -1)
-    means = camera.unproject(uv, z)
-    n = normals[rows, cols]
-    rays = np.stack([(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(z))], -1)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    cosine = np.clip(-(n * rays).sum(-1), 1 / settings.maximum_slant, 1.0)
-    # the steep axis lies in the surface along the slope seen from the camera; the level axis completes the frame
-    steep = rays + n * -(n * rays).sum(-1, keepdims=True)
-    length = np.linalg.norm(steep, axis=-1, keepdims=True)
-    helper = np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    steep = np.where(length > 1e-6, steep, helper - n * (n * helper).sum(-1, keepdims=True))
-    steep /= np.linalg.norm(steep, axis=-1, keepdims=True)
-    level = np.cross(n, steep)
-    frame = np.stack([steep, level, n], -1)  # columns: local axes in the camera
-    footprint = settings.spread * z / np.sqrt(camera.fx * camera.fy)
-    scales = np.stack([footprint / cosine, footprint, settings.thickness * footprint], -1)
-    colours = image[rows, cols] / 255.0
+    there = target & (depth > 0) & (np.abs(normals).sum(-1) > 0)
+    z = np.where(there, depth, 1.0).astype(np.float64)
+    rectangles, sums = _patches(image, np.where(there, 1 / z, 0.0), there, normals, settings)
+    top, left, height, width = rectangles.T
+    colours, disparity, normal = np.split(sums / (height * width)[:, None], [3, 4], axis=1)
+    z = 1 / disparity
+    uv = np.stack([left + width / 2, top + height / 2], -1)
+    rays = np.concatenate([(uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(z), 1))], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    # How far the plane moves for one pixel in the picture; along n·X = const, X = z·ray and z ~ 1 / (n·ray).
+    towards = np.minimum((normal * rays).sum(-1), -np.linalg.norm(rays, axis=-1) / settings.maximum_slant)
+    steps = np.diag([1 / camera.fx, 1 / camera.fy, 0])[:2]
+    slopes = normal @ steps.T / towards[:, None]
+    tangents = z[..., None] * (steps[None] - slopes[..., None] * rays[:, None])  # [N, 2, 3]
+    tangents -= (tangents @ normal[..., None]) * normal[:, None]
+    # The rasteriser widens 3D Gaussians by its low-pass, in pixels; surfels are drawn as they are.
+    low_pass = 0.0 if surfels else RasterSettings().low_pass
+    sides = np.stack([width, height], -1)[..., None]
+    sigma = np.sqrt(np.maximum((settings.spread * sides) ** 2 - low_pass, LEAST_SIGMA**2))
+    axes, scales, _ = np.linalg.svd(np.swapaxes(sigma * tangents, 1, 2), full_matrices=False)
+    frame = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], -1)  # columns: axes in the camera
+    scales = np.concatenate([scales, settings.thickness * scales[:, 1:]], -1)
     return Gaussians(
-        means=means.astype(np.float32),
+        means=camera.unproject(uv, z[:, 0]).astype(np.float32),
         log_scales=np.log(scales[:, : 2 if surfels else 3]).astype(np.float32),
         quats=matrices_to_quats(camera.R.T @ frame).astype(np.float32),
         opacity_logits=np.full(len(z), np.log(settings.opacity / (1 - settings.opacity)), np.float32),
-        sh=((colours - 0.5) / SH_C0)[:, None].astype(np.float32),
+        sh=((colours / 255.0 - 0.5) / SH_C0)[:, None].astype(np.float32),
     )
+
+
+def _patches(
+    image: np.ndarray,  # [H, W, 3] uint8
+    disparity: np.ndarray,  # [H, W]
+    target: np.ndarray,  # [H, W] bool, to be covered
+    normals: np.ndarray,  # [H, W, 3]
+    settings: SeedSettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rectangles (top, left, height, width) [N, 4] that tile the target; sums of colour, disparity, normal [N, 7].
+
+    From squares of a grid, every rectangle is halved, across the side where that saves more, until its colours are one
+    and its surface is plane, nearly. Colours that change evenly would be blended well by few large splats, too, but
+    not in every view: the nearer splat covers the farther, which shifts the texture away from the camera. A rectangle
+    that comes nearer to the target's edge than half of its own side is halved as well, so that no splat reaches out of
+    the hole by more than it has to.
+    """
+    size = settings.largest
+    tables = _SumTables(np.concatenate([image, disparity[..., None], normals], -1), target, size)
+    h, w = target.shape
+    corners = np.stack(np.meshgrid(np.arange(0, h, size), np.arange(0, w, size), indexing="ij"), -1).reshape(-1, 2)
+    pending = np.concatenate([corners, np.full_like(corners, size)], -1)
+    done = []
+    while len(pending):
+        pending = pending[tables.covered(pending) > 0]
+        misfit = tables.misfit(pending)
+        bend = np.sqrt(misfit[:, 3] / pending[:, 2:].prod(1)) * pending[:, 2:].prod(1) / tables.sums(pending)[:, 3]
+        fine = (misfit[:, :3].sum(1) <= settings.detail) & (bend <= settings.bend) & tables.inside(pending)
+        fine |= pending[:, 2:].prod(1) == 1
+        done.append(pending[fine])
+        pending = _halved(pending[~fine], tables)
+    found = np.concatenate(done)
+    found = found[np.lexsort((found[:, 1], found[:, 0]))]
+    return found, tables.sums(found)
+
+
+def _halved(
+    rectangles: np.ndarray,  # [N, 4]
+    tables: _SumTables,
+) -> np.ndarray:
+    """Both halves of each, cut so that colours are fitted best and no side is longer than four times the other."""
+    halves, misfits = [], []
+    for axis in (0, 1):
+        first = rectangles.copy()
+        first[:, 2 + axis] //= 2
+        second = first.copy()
+        second[:, axis] += first[:, 2 + axis]
+        misfit = (tables.misfit(first) + tables.misfit(second))[:, :3].sum(1)
+        sides = first[:, 2:]
+        halves.append((first, second))
+        misfits.append(np.where((sides == 0).any(1) | (sides.max(1) > 4 * sides.min(1)), np.inf, misfit))
+    down = (misfits[0] < misfits[1])[:, None]  # equal, as where all is flat: squares come of it, as sides alternate
+    down |= (misfits[0] == misfits[1])[:, None] & (rectangles[:, 2] > rectangles[:, 3])[:, None]
+    return np.concatenate([np.where(down, a, b) for a, b in zip(*halves)])
+
+
+class _SumTables:
+    """Sums over rectangles (top, left, height, width) [N, 4] of a picture, each in constant time (Crow 1984)."""
+
+    def __init__(self, values: np.ndarray, target: np.ndarray, size: int) -> None:
+        h, w = target.shape
+        beyond = ((0, -h % size), (0, -w % size))  # the grid's last squares
+        padded = np.pad(values.astype(np.float64), (*beyond, (0, 0)))
+        rows, cols = (i[..., None] + 0.5 for i in np.indices(padded.shape[:2]))
+        fitted, disparity = padded[..., :4], padded[..., 3:4]
+        self.first = _table(padded)
+        self.moments = [_table(m) for m in (fitted**2, rows * disparity, cols * disparity)]
+        self.target = _table(np.pad(target, beyond)[..., None])
+        # what lies outside of the picture is no edge
+        self.margin = size // 2
+        free = np.ones((h + 2 * size, w + 2 * size), bool)
+        free[self.margin : self.margin + h, self.margin : self.margin + w] = target
+        self.free = _table(free[..., None])
+
+    def sums(self, rectangles: np.ndarray) -> np.ndarray:
+        """[N, 7]."""
+        return _sum(self.first, rectangles)
+
+    def covered(self, rectangles: np.ndarray) -> np.ndarray:
+        """Target pixels, [N]."""
+        return _sum(self.target, rectangles)[:, 0]
+
+    def inside(self, rectangles: np.ndarray) -> np.ndarray:
+        """[N] bool: of target alone, and so is half a side all round."""
+        top, left, h, w = rectangles.T
+        around = np.stack([top + self.margin - h // 2, left + self.margin - w // 2, h + h // 2 * 2, w + w // 2 * 2], -1)
+        whole = self.covered(rectangles) == h * w
+        return whole & (_sum(self.free, around)[:, 0] == around[:, 2:].prod(1))
+
+    def misfit(self, rectangles: np.ndarray) -> np.ndarray:
+        """Squared residuals, summed, [N, 4]: of colours from their mean, of disparity from its best plane."""
+        top, left, h, w = (r[:, None] for r in rectangles.T)
+        pixels = np.maximum(h * w, 1)
+        total = self.sums(rectangles)[:, :4]
+        squares, by_row, by_col = (_sum(m, rectangles) for m in self.moments)
+        rest = squares - total**2 / pixels
+        for moment, start, side in ((by_row, top, h), (by_col, left, w)):
+            lever = (pixels * (side**2 - 1) / 12)[:, 0]
+            slope = moment[:, 0] - (start + side / 2)[:, 0] * total[:, 3]
+            rest[:, 3] -= slope**2 / np.where(lever > 0, lever, np.inf)
+        return np.maximum(rest, 0.0)
+
+
+def _table(values: np.ndarray) -> np.ndarray:
+    """[H+1, W+1, C] sums of all above and to the left."""
+    return np.pad(values, ((1, 0), (1, 0), (0, 0))).astype(np.float64).cumsum(0).cumsum(1)
+
+
+def _sum(table: np.ndarray, rectangles: np.ndarray) -> np.ndarray:
+    top, left, h, w = rectangles.T
+    return table[top + h, left + w] - table[top, left + w] - table[top + h, left] + table[top, left]
 
 
 def colour_gaussians(
@@ -89,6 +229,66 @@ def colour_gaussians(
     return replace(seeds, sh=pad_sh(fit.sh, bands))
 
 
+def settle_gaussians(
+    scene: Gaussians,  # without the new ones
+    new: Gaussians,
+    reference: Camera,
+    views: Sequence[Loader],
+    painted: Sequence[PaintedView],
+    settings: SeedSettings = SeedSettings(),
+) -> Gaussians:
+    """The new Gaussians that are needed, with colours such that the scene, drawn, shows the painted views.
+
+    Splats overlap one another and the rim, so a splat in its pixel's colour does not draw that pixel. A picture is
+    linear in the colours c_0, pixels = W c_0 + known; one gradient step of least squares, scaled by W's column sums
+    (SIRT), takes most of what is missing. It is taken over views all round: a step for the reference alone would undo,
+    there, how near splats cover far ones, and double that on the other side.
+
+    That covering moves the texture away from whoever looks, by part of a splat. Splats a little under the surface move
+    it back, from all sides: parallax draws what is deeper nearer to the viewer's foot.
+    """
+    others = [(view, paint) for view, paint in zip(views, painted) if paint.camera_id != reference.id]
+    stride = max(1, math.ceil(len(others) / max(1, settings.looks)))
+    looks = [(load(), paint) for load, paint in others[::stride]]
+    new = _sunk(new, reference, settings.sink)
+    joined = scene.extended(new)
+    cameras = [reference, *(view.camera for view, _ in looks)]
+    peaks = parallel_map(lambda c: contributions(joined, c).peak[len(scene) :], cameras)
+    new = new.take(np.max(peaks, axis=0) >= settings.needed)
+    for _ in range(settings.corrections if looks else 0):
+        steps = parallel_map(partial(_colour_step, scene, new), looks)
+        weights, missing = (np.sum(part, axis=0) for part in zip(*steps))
+        sh = new.sh.copy()
+        sh[:, 0] += missing / (weights + settings.hold)
+        new = replace(new, sh=sh)
+    return new
+
+
+def _sunk(
+    gaussians: Gaussians,
+    reference: Camera,
+    depth: float,  # in standard deviations along the longest axis
+) -> Gaussians:
+    """Flat Gaussians moved along their normal, away from the reference."""
+    means = gaussians.means.astype(np.float64)
+    normals = quats_to_matrices(gaussians.quats.astype(np.float64))[:, :, 2]
+    normals *= np.sign((normals * (means - reference.centre)).sum(-1, keepdims=True))
+    return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
+
+
+def _colour_step(
+    scene: Gaussians, new: Gaussians, look: tuple[ViewToPaint, PaintedView]
+) -> tuple[np.ndarray, np.ndarray]:
+    """W's column sums, and Wᵀ (painted − drawn) in units of c_0, [N, 3] each, where the view's own pixels painted."""
+    view, paint = look
+    wanted = np.isin(paint.rule_map(view.camera.height, view.camera.width), OWN_RULES)
+    drawn, way_back = pixel_region(scene, view.camera, wanted, passes=frozenset({"rgb"})).trace(new)
+    missing = np.where(wanted[..., None], paint.pasted(view.base) / 255.0 - drawn.rgb, 0.0)
+    one = np.broadcast_to(wanted[..., None], missing.shape)
+    weights, error = (way_back.backward(PictureGradients(rgb=g.astype(np.float32))).sh[:, 0] for g in (one, missing))
+    return weights / SH_C0, error / SH_C0**2
+
+
 def _seen_in(
     means: np.ndarray, load: Loader, paint: PaintedView, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,7 +298,7 @@ def _seen_in(
     uv, _ = view.camera.project(means[visible])
     cols, rows = uv.astype(int).T
     rules = paint.rule_map(view.camera.height, view.camera.width)
-    own = np.isin(rules[rows, cols], (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED))
+    own = np.isin(rules[rows, cols], OWN_RULES)
     index = visible[own]
     colours = paint.image[rows[own] - paint.top, cols[own] - paint.left] / 255.0
     return index, _towards(means[index], view.camera), colours

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
-from scenes import cameras, truth
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scenes import cameras, floor, truth
 
-from gimp3d.gaussians import SH_C0, quats_to_matrices
+from gimp3d.errors import BadInput
+from gimp3d.gaussians import SH_C0, Gaussians, quats_to_matrices
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 from gimp3d.solvers.harmonics import HarmonicsSettings, sh_basis
 from gimp3d.stages.propagate import PaintedView, Rule, ViewToPaint
-from gimp3d.stages.seed import SeedSettings, colour_gaussians, seed_gaussians
+from gimp3d.stages.seed import SeedSettings, _patches, colour_gaussians, seed_gaussians, settle_gaussians
 
 
+@pytest.mark.parametrize("largest", [1, 4])
+@pytest.mark.parametrize("surfels", [False, True])
 @pytest.mark.parametrize("index", [0, 1, 2])
-def test_seeds_alone_redraw_the_reference_without_cracks(index: int) -> None:
+def test_seeds_alone_redraw_the_reference_without_cracks(index: int, surfels: bool, largest: int) -> None:
     camera = cameras(9)[index].scaled(2)
     drawn = render(truth(), camera)
     image = render_bytes(truth(), camera)
     inner = drawn.median_depth > 0
-    seeds = seed_gaussians(camera, image, drawn.median_depth, inner, surfels=False)
+    settings = SeedSettings(largest=largest)
+    seeds = seed_gaussians(camera, image, drawn.median_depth, inner, surfels=surfels, settings=settings)
     again = render(seeds, camera)
     solid = inner.copy()
     solid[[0, 1, 2, -1, -2, -3]] = False
@@ -33,6 +42,80 @@ def test_seeds_alone_redraw_the_reference_without_cracks(index: int) -> None:
     assert error.mean() < 8
     relative = np.abs(again.median_depth - drawn.median_depth)[solid] / drawn.median_depth[solid]
     assert np.median(relative) < 0.015  # the discs of the scene are 3 % of the distance wide
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    arrays(bool, st.tuples(st.integers(1, 30), st.integers(1, 30))),
+    st.sampled_from([1, 2, 4, 8]),
+    st.sampled_from([0.0, 50.0, 1e9]),
+    st.integers(0, 9),
+)
+def test_patches_tile_the_target_exactly_and_keep_off_its_edge(
+    target: np.ndarray, largest: int, detail: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 255, (*target.shape, 3), np.uint8)
+    disparity, normals = np.ones(target.shape), np.zeros((*target.shape, 3))
+    normals[..., 2] = -1
+    target = cv2.dilate(target.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    found, sums = _patches(image, disparity, target, normals, SeedSettings(largest=largest, detail=detail))
+    count = np.zeros(target.shape, int)
+    around = np.pad(target, largest, constant_values=True)
+    for (top, left, h, w), total in zip(found, sums):
+        count[top : top + h, left : left + w] += 1
+        np.testing.assert_allclose(total[:3], image[top : top + h, left : left + w].sum((0, 1)))
+        assert max(h, w) <= min(largest, 4 * min(h, w))
+        high, wide = h // 2, w // 2
+        assert h * w == 1 or ((image[top : top + h, left : left + w] - total[:3] / h / w) ** 2).sum() <= detail + 1e-3
+        top, left = top + largest, left + largest
+        assert h * w == 1 or around[top - high : top + h + high, left - wide : left + w + wide].all()
+    assert np.array_equal(count, target)
+
+
+def test_flat_colour_and_surface_need_few_gaussians_and_texture_or_a_fold_many() -> None:
+    camera = cameras(9)[1].scaled(2)
+    v, u = np.indices((camera.height, camera.width))
+    flat = np.full((camera.height, camera.width, 3), 90, np.uint8)
+    plane = (1 / (0.2 + 1e-4 * u + 2e-4 * v)).astype(np.float32)
+    folded = (1 / (0.2 + 2e-2 * np.abs(v % 42 - 21))).astype(np.float32)
+    textured = np.random.default_rng(0).integers(0, 255, flat.shape, np.uint8)
+    target = np.zeros(flat.shape[:2], bool)
+    target[30:94, 40:168] = True
+
+    def share(image: np.ndarray, depth: np.ndarray) -> float:
+        return len(seed_gaussians(camera, image, depth, target, False)) / target.sum()
+
+    assert share(flat, plane) < 0.15
+    assert share(textured, plane) > 0.9
+    assert share(flat, plane) < share(flat, folded)
+
+
+@pytest.mark.parametrize("surfels", [False, True])
+def test_a_splat_has_its_patchs_shape_in_the_reference(surfels: bool) -> None:
+    """The ellipse drawn is σ² diag(w², h²) whatever the slant, as long as the surface is not grazing."""
+    camera = cameras(9)[1].scaled(2)
+    v, u = np.indices((camera.height, camera.width)) + 0.5
+    depth = (1 / (0.3 + 3e-4 * u + 1e-3 * v)).astype(np.float64)
+    image = np.full((camera.height, camera.width, 3), 90, np.uint8)
+    target = np.zeros(depth.shape, bool)
+    target[60:100, 60:100] = True
+    seeds = seed_gaussians(camera, image, depth, target, surfels)
+    axes = quats_to_matrices(seeds.quats) * np.pad(seeds.scales, ((0, 0), (0, 3 - seeds.scales.shape[1])))[:, None]
+    local = np.einsum("ij,njk->nik", camera.R, axes)
+    points = (seeds.means - camera.centre) @ camera.R.T
+    x, y, z = points.T
+    jacobian = np.zeros((len(z), 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    flat = jacobian @ local
+    covariance = flat @ np.swapaxes(flat, 1, 2)
+    sides = np.sqrt(covariance[:, [0, 1], [0, 1]] + (0 if surfels else 0.3)) / 0.75
+    closest = 2 ** np.rint(np.log2(sides))
+    thick = 0 if surfels else 0.05  # the thin axis shows a little, where the surface is seen askew
+    np.testing.assert_allclose(sides, closest, rtol=0.02 + thick)
+    assert set(np.unique(closest)) == {1, 2, 4}
+    assert np.abs(covariance[:, 0, 1]).max() < (0.02 + thick) * covariance[:, [0, 1], [0, 1]].max()
 
 
 @pytest.mark.parametrize("surfels", [False, True])
@@ -63,7 +146,7 @@ def test_one_view_gives_sh_degree_zero() -> None:
     drawn = render(truth(), camera)
     image = render_bytes(truth(), camera)
     target = drawn.median_depth > 0
-    seeds = seed_gaussians(camera, image, drawn.median_depth, target, False)
+    seeds = seed_gaussians(camera, image, drawn.median_depth, target, False, SeedSettings(largest=1))
     coloured = colour_gaussians(seeds, camera, [], [], scene_degree=2, settings=SeedSettings(sh_degree=2))
     assert coloured.sh.shape[1] == 9 and (coloured.sh[:, 1:] == 0).all()
     rows, cols = np.nonzero(target)
@@ -98,8 +181,8 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
     means = seeds.means.astype(float)
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
-    settings = SeedSettings(harmonics=HarmonicsSettings(floor=0.01, offset=True))
-    coloured = colour_gaussians(seeds, reference, views, painted, 3, settings)
+    loose = SeedSettings(harmonics=HarmonicsSettings(floor=0.01, offset=True))
+    coloured = colour_gaussians(seeds, reference, views, painted, 3, loose)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9
 
@@ -115,3 +198,74 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
         assert np.median(np.abs(change - expected)) < 0.03
     careful = colour_gaussians(seeds, reference, views, painted, 3)  # the default holds on to c_0 harder
     assert 0 < np.abs(careful.sh[:, 1:]).mean() < np.abs(coloured.sh[:, 1:]).mean()
+
+
+def _hole_and_truth(count: int = 9) -> tuple[list[ViewToPaint], list[PaintedView]]:
+    """Views of the floor with a hole, and what they should show."""
+    views, painted = [], []
+    for camera in cameras(count, 360, 270):
+        image, drawn = render_bytes(truth(), camera), render(truth(), camera)
+        target = (drawn.alpha > 0.9) & (render(floor(with_hole=True), camera).alpha < 0.9)
+        rules = np.where(target, Rule.OWN_PIXELS, Rule.UNTOUCHED).astype(np.uint8)
+        depth = drawn.median_depth
+        views.append(ViewToPaint(camera, image, image, target, target, depth, depth))
+        painted.append(PaintedView(camera.id, 0, 0, image, image, rules))
+    return views, painted
+
+
+def _filled(views: list[ViewToPaint], painted: list[PaintedView], chosen: SeedSettings) -> Gaussians:
+    known, view = floor(with_hole=True), views[1]
+    seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False, chosen)
+    return settle_gaussians(known, seeds, view.camera, [partial(lambda v: v, v) for v in views], painted, chosen)
+
+
+def test_settled_colours_leave_no_seam_and_show_every_view_better_than_pixel_colours() -> None:
+    """Across the hole's rim, the drawn picture has hardly more of a step that the true one has not than elsewhere."""
+    views, painted = _hole_and_truth()
+    known = floor(with_hole=True)
+    errors, seams = [], []
+    for corrections in (0, 1):
+        new = _filled(views, painted, SeedSettings(corrections=corrections))
+        assert 0 < len(new) < 0.7 * views[1].target.sum()
+        error, at_rim, inside = [], [], []
+        for view in views:
+            drawn = render_bytes(known.extended(new), view.camera).astype(float)
+            wrong = (drawn - view.image).mean(-1)
+            steps = np.hypot(*np.gradient(wrong))
+            rim = cv2.morphologyEx(view.target.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+            error.append(np.sqrt((wrong[view.target] ** 2).mean()))
+            at_rim.append(steps[rim].mean())
+            inside.append(steps[view.target & ~rim].mean())
+        errors.append(np.mean(error))
+        seams.append(np.mean(at_rim) / np.mean(inside))
+    assert errors[1] < 0.97 * errors[0] and errors[1] < 9  # grey levels
+    assert seams[1] < 1.25
+    open_rim = [np.hypot(*np.gradient((render_bytes(known, v.camera).astype(float) - v.image).mean(-1))) for v in views]
+    assert np.mean([steps[v.target].mean() for steps, v in zip(open_rim, views)]) > 3 * np.mean(at_rim)
+
+
+def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
+    views, painted = _hole_and_truth()
+    view = views[1]
+    seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
+    below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
+    load = [partial(lambda v: v, v) for v in views]
+    new = settle_gaussians(truth(), below, view.camera, load, painted, SeedSettings(corrections=0))
+    assert len(new) < 0.1 * len(below)  # the floor hides them
+    everything = settle_gaussians(
+        truth(), below, view.camera, load, painted, SeedSettings(needed=0, corrections=0, sink=0)
+    )
+    assert np.array_equal(everything.means, below.means)
+
+
+def test_a_patch_size_that_cannot_be_halved_is_refused() -> None:
+    camera = cameras(9)[1]
+    with pytest.raises(BadInput, match="power of two"):
+        seed_gaussians(
+            camera,
+            np.zeros((90, 120, 3), np.uint8),
+            np.ones((90, 120)),
+            np.ones((90, 120), bool),
+            False,
+            SeedSettings(largest=3),
+        )
