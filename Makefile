@@ -6,7 +6,8 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large bench-references \
+	extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -33,7 +34,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
-	bench-pareto
+	bench-pareto bench-references
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -51,6 +52,10 @@ bench-depth: $(READY)
 
 bench-propagate: $(READY)
 	$(BIN)/python scripts/bench_propagate.py $(DATA)
+
+# 128 removals: half an hour or more
+bench-references: $(READY)
+	$(BIN)/python scripts/bench_references.py $(DATA)
 
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)

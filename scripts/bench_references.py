@@ -3,7 +3,7 @@ at random with the built-in fill. On scenes rendered with and without the object
 
 Writes OUT/references.json, OUT/references.md and a chart. Run by `make bench-references`.
 
-    python scripts/bench_references.py [DATA] [--quick] [--scenes a,b] [--out build/bench_references] [--chart FILE.svg]
+    python scripts/bench_references.py [DATA] [--quick] [--scenes a,b] [--steps N] [--out build/bench_references]
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import product
 from multiprocessing import get_context
@@ -29,7 +29,7 @@ from gimp3d.camera import Camera
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.io.images import read_image
-from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
+from gimp3d.pipeline import PRESETS, RemovalSettings, View, remove_object, render_bytes
 from gimp3d.threads import available_cores, set_thread_count
 
 SCENES = ("desk", "corner", "gloss", "rocks")
@@ -46,6 +46,7 @@ class Group:
     kind: str
     preset: str
     count: int  # of references
+    steps: int  # of refinement at most
 
 
 @dataclass
@@ -70,15 +71,16 @@ def main() -> int:
     parser.add_argument("data", nargs="?", type=Path, default=ROOT.parent / "shared" / "data" / "withwithout")
     parser.add_argument("--quick", action="store_true", help="one scene and two references of each kind only")
     parser.add_argument("--scenes", default=",".join(SCENES), help="names, separated by commas")
+    parser.add_argument("--steps", type=int, default=100, help="of refinement at most; the paper's preset has 3,000")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "bench_references")
     parser.add_argument("--chart", type=Path, help="default: assets/references.svg, or in OUT if not all is measured")
     given = parser.parse_args()
     names = given.scenes.split(",")[: 1 if given.quick else None]
     groups = [
-        Group(given.data / name, kind, preset, 2 if given.quick else count)
+        Group(given.data / name, kind, preset, 2 if given.quick else count, given.steps)
         for name, (kind, count), preset in product(names, ((GIVEN, sys.maxsize), (FILLED, DRAWN)), MODES)
     ]
-    results: dict[str, Any] = {"quick": given.quick, "machine": machine(), "references": []}
+    results: dict[str, Any] = {"machine": machine(), "steps": given.steps, "references": []}
     try:
         with ProcessPoolExecutor(AT_ONCE, get_context("spawn"), share_threads) as workers:
             for rows in workers.map(measured, groups):
@@ -100,11 +102,13 @@ def share_threads() -> None:
 def measured(group: Group) -> list[dict[str, Any]]:
     """A row for each reference: PSNR of every test view but the reference, or why the removal was refused."""
     scene, store = _scene(group.folder), MasksOnly()
+    preset = PRESETS[group.preset]
+    settings = replace(preset, refine=replace(preset.refine, steps=min(preset.refine.steps, group.steps)))
     rows = []
     for camera, picture in references(scene, group):
         row = {"scene": scene.name, "kind": group.kind, "preset": group.preset, "reference": camera.id}
         try:
-            row["views"] = scores(scene, group.preset, camera, picture, None if group.kind == GIVEN else store)
+            row["views"] = scores(scene, settings, camera, picture, None if group.kind == GIVEN else store)
             means = [np.mean([v[mask] for v in row["views"].values()]) for mask in ("mask", "unseen")]
             said = f"{means[0]:.2f} dB in mask, {means[1]:.2f} dB in unseen"
         except IllPosed as error:
@@ -124,7 +128,7 @@ def references(scene: Scene, group: Group) -> Iterator[tuple[Camera, np.ndarray 
 
 
 def scores(
-    scene: Scene, preset: str, reference: Camera, picture: np.ndarray | None, store: MasksOnly | None
+    scene: Scene, settings: RemovalSettings, reference: Camera, picture: np.ndarray | None, store: MasksOnly | None
 ) -> dict[str, dict[str, float]]:
     """ID of test view → PSNR in what the object hides, and in what no training view sees of it. Whole removal.
 
@@ -133,7 +137,7 @@ def scores(
     views = [View(c, scene.photos[c.id]) for c in scene.train]
     if picture is not None:
         views.append(View(reference, render_bytes(scene.gaussians, reference)))
-    result = remove_object(scene.gaussians, views, scene.region, PRESETS[preset], reference.id, picture, store=store)
+    result = remove_object(scene.gaussians, views, scene.region, settings, reference.id, picture, store=store)
     left = scene.gaussians.take(result.keep)
     filled = left if result.added is None else left.extended(result.added)
     found = {}

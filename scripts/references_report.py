@@ -20,9 +20,10 @@ def markdown(results: dict[str, Any]) -> str:
     host, rows = results["machine"], results["references"]
     parts = [
         "# Each view as the reference\n",
-        f"{host['cpu']}, {host['cores']} cores. Whole removals; PSNR in dB of the test views, drawn from the filled "
-        "splat, without the reference itself. Mean ± σ over references (n - 1). *By view*: σ once each view's own mean "
-        "is taken out, as leaving out another view changes a mean as well.\n",
+        f"{host['cpu']}, {host['cores']} cores. Whole removals, {results['steps']} steps of refinement at most. PSNR "
+        "in dB of the test views, drawn from the filled splat, without the reference itself. Mean ± σ over references "
+        "(n - 1). *By view*: σ once each view's own mean is taken out, as leaving out another view changes a mean as "
+        "well.\n",
     ]
     for kind, words in (
         (GIVEN, "each test view, given its true picture, scored on the others"),
