@@ -108,7 +108,7 @@ def measured(group: Group) -> list[dict[str, Any]]:
     for camera, picture in references(scene, group):
         row = {"scene": scene.name, "kind": group.kind, "preset": group.preset, "reference": camera.id}
         try:
-            row["views"] = scores(scene, settings, camera, picture, None if group.kind == GIVEN else store)
+            row |= removal(scene, settings, camera, picture, None if group.kind == GIVEN else store)
             means = [np.mean([v[mask] for v in row["views"].values()]) for mask in ("mask", "unseen")]
             said = f"{means[0]:.2f} dB in mask, {means[1]:.2f} dB in unseen"
         except IllPosed as error:
@@ -127,12 +127,13 @@ def references(scene: Scene, group: Group) -> Iterator[tuple[Camera, np.ndarray 
         yield from ((scene.train[k], None) for k in drawn)
 
 
-def scores(
+def removal(
     scene: Scene, settings: RemovalSettings, reference: Camera, picture: np.ndarray | None, store: MasksOnly | None
-) -> dict[str, dict[str, float]]:
+) -> dict[str, Any]:
     """ID of test view → PSNR in what the object hides, and in what no training view sees of it. Whole removal.
 
-    As in `gimp3d remove`, a reference that is no training view has no photo, but shows the scene as drawn.
+    And the reference's own score: how much of the surface that has to be made up it shows, and how well. As in
+    `gimp3d remove`, a reference that is no training view has no photo, but shows the scene as drawn.
     """
     views = [View(c, scene.photos[c.id]) for c in scene.train]
     if picture is not None:
@@ -146,7 +147,8 @@ def scores(
             drawn, truth = render_bytes(filled, camera), read_image(scene.folder / camera.id)
             masks = {"mask": scene.hides(camera), "unseen": scene.unseen(camera)}
             found[camera.id] = {name: psnr(drawn, truth, mask) for name, mask in masks.items()}
-    return found
+    score = next(s.score for s in result.references[0].scores if s.camera_id == reference.id)
+    return {"views": found, "score": score}
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from raster_report import table
 
 GIVEN, FILLED = "true picture", "built-in fill"
 MASKS = {"mask": "what the object hides", "unseen": "what no training view sees of it"}
-WANTED = 0.8  # dB, σ with true pictures
+GOOD = 0.5  # of the best reference's score: what shows the surface less well counts as a poor reference
 WIDTH, TOP, PLOT, BETWEEN = 1120, 110, 230, 90
 Row = dict[str, Any]
 
@@ -23,7 +23,8 @@ def markdown(results: dict[str, Any]) -> str:
         f"{host['cpu']}, {host['cores']} cores. Whole removals, {results['steps']} steps of refinement at most. PSNR "
         "in dB of the test views, drawn from the filled splat, without the reference itself. Mean ± σ over references "
         "(n - 1). *By view*: σ once each view's own mean is taken out, as leaving out another view changes a mean as "
-        "well.\n",
+        "well. *Good*: σ of the references that score at least half as high as the best one; what others show "
+        "poorly or not at all is made up by later references, whatever picture is given.\n",
     ]
     for kind, words in (
         (GIVEN, "each test view, given its true picture, scored on the others"),
@@ -56,6 +57,10 @@ def sigma_by_view(rows: Sequence[Row], mask: str) -> float:
     return sigma([float(np.mean([v[mask] - usual[n] for n, v in r["views"].items()])) for r in rows])
 
 
+def is_good(row: Row, others: Sequence[Row]) -> bool:
+    return bool(row["score"] >= GOOD * max(r["score"] for r in others))
+
+
 def mean_sigma(rows: Sequence[Row], preset: str, mask: str) -> float:
     """Mean over scenes."""
     return float(np.mean([sigma(means(done(rows, s, preset), mask)) for s in names_of(rows, "scene")]))
@@ -67,7 +72,7 @@ def names_of(rows: Sequence[Row], key: str) -> list[str]:
 
 def spread_table(rows: Sequence[Row]) -> str:
     head = ["scene", "preset", "references", "refused"]
-    head += [f"{mask}, {what}" for mask in MASKS for what in ("mean ± σ", "worst", "σ by view")]
+    head += [f"{mask}, {what}" for mask in MASKS for what in ("mean ± σ", "worst", "σ by view", "good")]
     lines: list[list[Any]] = []
     for scene in names_of(rows, "scene"):
         for preset in names_of(rows, "preset"):
@@ -77,10 +82,11 @@ def spread_table(rows: Sequence[Row]) -> str:
             for mask in MASKS:
                 values = means(found, mask)
                 if not values:
-                    cells += ["", "", ""]
+                    cells += ["", "", "", ""]
                     continue
                 cells += [f"{np.mean(values):.2f} ± {sigma(values):.2f}", f"{min(values):.2f}"]
-                cells.append(f"{sigma_by_view(found, mask):.2f}")
+                good = means([r for r in found if is_good(r, found)], mask)
+                cells += [f"{sigma_by_view(found, mask):.2f}", f"{sigma(good):.2f} ({len(good)})"]
             lines.append(cells)
     return table(head, lines)
 
@@ -101,8 +107,9 @@ def references_table(rows: Sequence[Row]) -> str:
     lines = []
     for r in rows:
         cells = [f"{means([r], mask)[0]:.2f}" for mask in MASKS] if "views" in r else [r["refused"], ""]
-        lines.append([r["scene"], r["kind"], r["preset"], r["reference"], *cells])
-    return table(["scene", "picture", "preset", "reference", *MASKS], lines)
+        score = f"{r['score']:.2f}" if "score" in r else ""
+        lines.append([r["scene"], r["kind"], r["preset"], r["reference"], score, *cells])
+    return table(["scene", "picture", "preset", "reference", "score", *MASKS], lines)
 
 
 def draw_chart(results: dict[str, Any]) -> str:
@@ -130,16 +137,18 @@ def draw_chart(results: dict[str, Any]) -> str:
                 for k, preset in enumerate(presets):
                     found = done([r for r in rows if r["kind"] == kind], scene, preset)
                     place = n + (k + 1) / (len(presets) + 1)
-                    parts += column(means(found, mask), x_axis.place(place), y_axis, colours[preset])
-    subtitle = "Whole removals; a dot is the mean of the test views for one reference; bar: mean, figure: σ in dB"
+                    parts += column(found, mask, x_axis.place(place), y_axis, colours[preset])
+    subtitle = "Mean PSNR of the test views by reference (rings: it shows the surface poorly); bar: mean; figure: σ"
     return page(WIDTH, TOP + 2 * PLOT + BETWEEN + 50, "The same removal from other references", subtitle, parts)
 
 
-def column(values: Sequence[float], x: float, y_axis: Axis, colour: str) -> list[str]:
+def column(rows: Sequence[Row], mask: str, x: float, y_axis: Axis, colour: str) -> list[str]:
     """The references' dots, their mean and its σ."""
-    if not values:
+    if not rows:
         return []
+    values = means(rows, mask)
     y, highest = y_axis.place(float(np.mean(values))), y_axis.place(max(values))
     bar = f'<line x1="{x - 13:.1f}" y1="{y:.1f}" x2="{x + 13:.1f}" y2="{y:.1f}" stroke="{colour}" stroke-width="2"/>'
-    dots = [mark("ring", x, y_axis.place(v), colour) for v in values]
+    shapes = ["dot" if is_good(r, rows) else "ring" for r in rows]
+    dots = [mark(shape, x, y_axis.place(v), colour) for shape, v in zip(shapes, values)]
     return [*dots, bar, text(x, highest - 9, f"{sigma(values):.2f}", anchor="middle", colour=FAINT, size=11)]

@@ -18,7 +18,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "bench_references.py"
 
 def row(reference: str, views: dict[str, float], preset: str = "balanced", kind: str = GIVEN) -> dict[str, Any]:
     scores = {name: {"mask": value, "unseen": value - 2} for name, value in views.items()}
-    return {"scene": "desk", "kind": kind, "preset": preset, "reference": reference, "views": scores}
+    return {"scene": "desk", "kind": kind, "preset": preset, "reference": reference, "views": scores, "score": 0.8}
 
 
 def test_easy_and_hard_views_are_no_spread_of_the_references() -> None:
@@ -37,11 +37,14 @@ def test_a_worse_reference_is_spread_either_way() -> None:
 
 
 def test_tables_and_chart_show_references_that_were_refused() -> None:
-    refused = {k: v for k, v in row("c", {}, "paper", FILLED).items() if k != "views"} | {"refused": "sees no hole"}
+    refused = {k: v for k, v in row("c", {}, "paper", FILLED).items() if k not in ("views", "score")} | {
+        "refused": "sees no hole"
+    }
     rows = [row("a", {"x": 30.0}), row("b", {"x": 32.0}), row("a", {"x": 20.0}, "paper", FILLED), refused]
     results = {"machine": {"cpu": "any", "cores": 4}, "steps": 0, "references": rows}
     words = markdown(results)
     assert "| desk | balanced | 2 | 0 | 31.00 ± 1.41 |" in words
+    assert "| 1.41 (2) |" in words
     assert "| desk | paper | 1 | 1 | 20.00 ± nan |" in words and "| sees no hole |" in words
     drawn = ElementTree.fromstring(draw_chart(results))
     assert "1.41" in {t.text for t in drawn.iter("{http://www.w3.org/2000/svg}text")}
