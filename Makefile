@@ -53,7 +53,7 @@ bench-depth: $(READY)
 bench-propagate: $(READY)
 	$(BIN)/python scripts/bench_propagate.py $(DATA)
 
-# 128 removals: half an hour or more
+# 128 removals: an hour
 bench-references: $(READY)
 	$(BIN)/python scripts/bench_references.py $(DATA)
 
