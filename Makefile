@@ -5,9 +5,8 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large bench-references \
-	extension screenshots clean
+.PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large bench-references extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -27,6 +26,11 @@ test: $(READY)
 
 test-all: $(READY) lint
 	$(BIN)/python -m pytest
+	$(BIN)/python scripts/test_blenders.py
+
+# the add-on's tests under Blender 4.5 LTS and 5.2 LTS
+test-blenders: $(READY)
+	$(BIN)/python scripts/test_blenders.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -34,8 +38,8 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
-	bench-pareto bench-references
-	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best,paper --out build/bench
+	bench-pareto
+	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
@@ -53,7 +57,7 @@ bench-depth: $(READY)
 bench-propagate: $(READY)
 	$(BIN)/python scripts/bench_propagate.py $(DATA)
 
-# 128 removals: an hour
+# 128 removals: an hour, so not part of bench
 bench-references: $(READY)
 	$(BIN)/python scripts/bench_references.py $(DATA)
 
@@ -87,8 +91,10 @@ bench-inpaint: $(READY) $(OTHERS)/.ready
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
 
+# in a real Blender with its window, on a virtual screen: root on Debian, see scripts/screenshots.py
 screenshots: demo
 	cp build/demo/before_after.png assets/before_after.png
+	$(BIN)/python scripts/screenshots.py
 
 clean:
 	rm -rf build dist $(VENV)

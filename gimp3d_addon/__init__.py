@@ -5,9 +5,12 @@ from __future__ import annotations
 import bpy
 
 from . import command, panels, properties
-from .operators import io, reference, remove, roi, views
+from .operators import base, display, environment, io, presets, reference, remove, roi, views
 
-MODULES = (properties, io, roi, views, reference, remove, panels, command)
+MODULES = (
+    *(properties, base, environment, io, display, roi, views, reference, remove, presets),
+    *(panels, command),
+)
 
 
 def register() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import bpy
@@ -80,14 +80,15 @@ def camera_from_blender(
     if CAMERA in obj:
         stored = json.loads(obj[CAMERA])
         distortion = Distortion(*stored["distortion"]) if stored["distortion"] else None
-        there = name is None and not _moved(viewmat, np.array(stored["viewmat"]), frame)
+        imported = np.array(stored["viewmat"])
+        there = name is None and not _moved(viewmat, imported, frame)
+        viewmat = imported if there else viewmat  # to the last bit, which Blender's float32 does not keep
         image = Path(stored["image"]) if stored["image"] and there else None
         size = (stored["width"], stored["height"])
         intrinsics = (stored["fx"], stored["fy"], stored["cx"], stored["cy"])
         return Camera(name or stored["id"], *size, *intrinsics, viewmat, stored["split"], image, distortion)
     render = scene.render
-    width = max(1, int(render.resolution_x * render.resolution_percentage / 100))
-    height = max(1, int(render.resolution_y * render.resolution_percentage / 100))
+    width, height = render_size(scene)
     p = obj.calc_matrix_camera(
         depsgraph, x=width, y=height, scale_x=render.pixel_aspect_x, scale_y=render.pixel_aspect_y
     )
@@ -96,9 +97,30 @@ def camera_from_blender(
     return Camera(name or safe_name(obj.name), width, height, fx, fy, cx, cy, viewmat)
 
 
+def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
+    """Width and height of the scene's renders, pixels."""
+    render = scene.render
+    share = render.resolution_percentage / 100
+    return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
+
+
+def own_size(obj: bpy.types.Object, scene: bpy.types.Scene) -> tuple[int, int]:
+    """Width and height of a camera's picture: an imported one has its own."""
+    if CAMERA not in obj:
+        return render_size(scene)
+    stored = json.loads(obj[CAMERA])
+    return stored["width"], stored["height"]
+
+
+def photo_of(obj: bpy.types.Object) -> Path | None:
+    """The photo that a camera was imported with."""
+    stored = json.loads(obj[CAMERA])["image"] if CAMERA in obj else None
+    return Path(stored) if stored else None
+
+
 def has_photo(obj: bpy.types.Object) -> bool:
     """Whether a camera was imported with a photo, even if it has been moved away from it since."""
-    return CAMERA in obj and json.loads(obj[CAMERA])["image"] is not None
+    return photo_of(obj) is not None
 
 
 def _moved(viewmat: np.ndarray, imported: np.ndarray, frame: np.ndarray) -> bool:
@@ -188,6 +210,36 @@ def _chosen_views(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tup
     reference = present(scene, settings.reference)
     if reference is not None and reference not in chosen:
         yield camera_from_blender(reference, frame, scene, context.evaluated_depsgraph_get()), reference
+
+
+@dataclass(frozen=True)
+class ViewSize:
+    """What a view costs."""
+
+    width: int  # pixels
+    height: int
+    photo: bool
+
+
+def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
+    """Of the views that `views_of` would give, without going through an animation's frames.
+
+    Raises
+    ------
+    BadInput
+        If a view cannot be used, with what to do.
+    """
+    scene, settings = context.scene, context.scene.gimp3d
+    if settings.views == "ANIMATED":
+        cameras = [scene.camera] if scene.camera else []
+        times = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
+    else:
+        cameras, times = chosen_cameras(scene), 1
+    for obj in cameras:
+        if obj.data.type != "PERSP":
+            raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
+    animated = settings.views == "ANIMATED"
+    return [ViewSize(*own_size(obj, scene), has_photo(obj) and not animated) for obj in cameras] * times
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:

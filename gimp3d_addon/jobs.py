@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -19,6 +21,8 @@ from gimp3d.job import RemovalJob, save_job, write_atomically
 from . import bridge, splats
 from .operators.base import current_boxes, current_splat
 from .properties import GIMP3D_preferences
+
+STATE = "blender.json"  # in a job's folder: what Blender wants back from it
 
 
 def jobs_folder() -> Path:
@@ -38,6 +42,42 @@ def new_job_folder(name: str) -> Path:
     while (root / f"{clean}-{number:03d}").exists():
         number += 1
     return root / f"{clean}-{number:03d}"
+
+
+def open_for(folder: Path, splat: bpy.types.Object) -> None:
+    """Note in a job's folder which object it is about, and that its result is still to come."""
+    _write_state(folder, {"source": splat.name, "matrix": [list(r) for r in splat.matrix_world], "open": True})
+
+
+def close(folder: Path) -> None:
+    """The job's result is in the scene, or there will be none."""
+    _write_state(folder, {**_state(folder), "open": False})
+
+
+def source_of(folder: Path) -> tuple[str, list[list[float]]]:
+    """The name and the matrix of the object that a job is about."""
+    state = _state(folder)
+    return state["source"], state["matrix"]
+
+
+def unfinished(context: bpy.types.Context) -> Path | None:
+    """The last job of this scene, else the newest beside the file, if its result never came."""
+    known = context.scene.gimp3d.last_job
+    found = [Path(known)] if known else []
+    with suppress(OSError):
+        found += sorted(jobs_folder().iterdir(), key=lambda p: -p.stat().st_mtime)[:1]
+    return next((f for f in found if _state(f).get("open")), None)
+
+
+def _state(folder: Path) -> dict[str, Any]:
+    try:
+        return json.loads((folder / STATE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _write_state(folder: Path, state: dict[str, Any]) -> None:
+    write_atomically(folder / STATE, lambda f: f.write(json.dumps(state).encode()))
 
 
 def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True) -> RemovalJob:
@@ -62,10 +102,11 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     for camera, obj in views:
         if wanted is not None and obj == wanted and not reference:
             reference = camera.id
-    picture = bpy.path.abspath(settings.reference_image) if settings.reference_image else ""
+    painted = settings.reference_paint
+    picture = bpy.path.abspath(settings.reference_image) if settings.reference_image and painted is None else ""
     if picture and not Path(picture).is_file():
         raise BadInput(f"the reference picture {picture} does not exist")
-    if picture and not reference:
+    if (picture or painted is not None) and not reference:
         raise BadInput("a reference picture needs its camera; choose the reference view")
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,6 +115,9 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
         shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")
+    if painted is not None:
+        picture = str(folder / "reference.png")
+        painted.save(filepath=picture, save_copy=True)
     job = RemovalJob(
         scene=str(folder / "scene.ply"),
         cameras=str(folder / "transforms.json"),

@@ -1,115 +1,271 @@
-"""The N-panel 3D-GIMP: four steps that say what is missing."""
+"""The N-panel 3D-GIMP: four steps that say what is missing and offer the button that mends it."""
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import bpy
+from bl_ui.utils import PresetPanel
 
-from gimp3d.errors import BadInput
+from . import jobs, splats, steps
+from .operators.base import RunsChild, current_splat
+from .operators.display import unfit_settings
+from .operators.remove import source_in
+from .operators.roi import FITS
+from .worker import duration
 
-from . import bridge
-from .operators.base import current_boxes, current_splat
+LINE = 38  # characters that fit into the panel's default width
 
 
-class GIMP3D_PT_main(bpy.types.Panel):
-    """Scene · Region · Views · Remove"""
+class InTab:
+    """Mixin: a panel of the tab 3D-GIMP."""
 
-    bl_idname = "GIMP3D_PT_main"
-    bl_label = "3D-GIMP"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "3D-GIMP"
 
-    def draw(self, context: bpy.types.Context) -> None:
-        settings, layout = context.scene.gimp3d, self.layout
-        splat, boxes = current_splat(context), current_boxes(context)
-        self._scene(layout.box(), settings, splat)
-        self._region(layout.box(), splat, boxes)
-        self._views(layout.box(), context)
-        self._remove(layout.box(), context)
 
-    @staticmethod
-    def _scene(box: bpy.types.UILayout, settings: bpy.types.PropertyGroup, splat: bpy.types.Object | None) -> None:
-        box.label(text="1  Scene", icon="OUTLINER_OB_POINTCLOUD")
-        box.prop(settings, "splat", text="")
-        if splat is None:
-            box.label(text="No splat scene yet", icon="INFO")
-        else:
-            box.label(text=f"{len(splat.data.vertices):,} splats")
-        row = box.row(align=True)
-        row.operator("gimp3d.import_ply", text="Import")
-        row.operator("gimp3d.export_ply", text="Export")
+class Advanced(InTab):
+    """Mixin: a closed sub-panel."""
 
-    @staticmethod
-    def _region(box: bpy.types.UILayout, splat: bpy.types.Object | None, boxes: list[bpy.types.Object]) -> None:
-        box.label(text="2  Region", icon="MESH_CUBE")
-        if boxes:
-            box.label(text=", ".join(b.name for b in boxes))
-        else:
-            box.label(text="Put a box round the object", icon="INFO")
-        row = box.row(align=True)
-        row.operator("gimp3d.add_roi")
-        row.operator("gimp3d.clear_rois", text="", icon="X")
-
-    @staticmethod
-    def _views(box: bpy.types.UILayout, context: bpy.types.Context) -> None:
-        settings = context.scene.gimp3d
-        box.label(text="3  Views", icon="CAMERA_DATA")
-        box.prop(settings, "views", text="")
-        if settings.views == "COLLECTION":
-            box.prop(settings, "view_collection", text="")
-        try:
-            found = len(bridge.chosen_cameras(context.scene))
-        except BadInput:
-            found = 0
-        if settings.views == "ANIMATED":
-            scene = context.scene
-            found = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step)) if scene.camera else 0
-        box.label(text=f"{found} views" if found else "No camera yet", icon="NONE" if found else "INFO")
-        row = box.row(align=True)
-        row.operator("gimp3d.add_views", text="Orbit")
-        row.operator("gimp3d.import_cameras", text="Import")
-
-    @staticmethod
-    def _remove(box: bpy.types.UILayout, context: bpy.types.Context) -> None:
-        settings = context.scene.gimp3d
-        box.label(text="4  Remove", icon="TRASH")
-        box.prop(settings, "preset", text="")
-        if settings.status:
-            box.progress(factor=settings.progress, text=settings.status)
-        box.operator("gimp3d.remove_object")
-        row = box.row(align=True)
-        row.operator("gimp3d.preview_masks")
-        row.operator("gimp3d.restore")
-        if settings.last_report:
-            opened = box.operator("wm.url_open", text="Open Report", icon="URL")
-            opened.url = Path(settings.last_report).as_uri()
-
-
-class GIMP3D_PT_reference(bpy.types.Panel):
-    """Who completes the picture, and from where"""
-
-    bl_idname = "GIMP3D_PT_reference"
-    bl_label = "Reference and Fill"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "3D-GIMP"
-    bl_parent_id = "GIMP3D_PT_main"
     bl_options = {"DEFAULT_CLOSED"}
 
+
+class StepPanel(InTab):
+    """Mixin: a step, with a tick in its header once nothing is missing."""
+
+    step = staticmethod(steps.scene_step)
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        self.layout.label(text="", icon="ERROR" if self.step(context).missing else "CHECKMARK")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        step = self.step(context)
+        self.choose(self.layout, context)
+        if step.facts:
+            self.layout.label(text=" · ".join(step.facts))
+        if step.hint:
+            say(self.layout, step.hint, "INFO")
+        if step.missing:
+            say(self.layout, step.missing, "ERROR")
+            for fix in step.fixes:
+                button(self.layout, fix)
+        self.act(self.layout, context)
+
+    def choose(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        """What is chosen, above what is known of it."""
+
+    def act(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        """The step's buttons."""
+
+
+def say(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    """A message in as many lines as it needs."""
+    column = layout.column(align=True)
+    for k, line in enumerate(textwrap.wrap(text, LINE)):
+        column.label(text=line, icon="BLANK1" if k else icon)
+
+
+def button(layout: bpy.types.UILayout, fix: steps.Fix) -> None:
+    made = layout.operator(fix.operator, text=fix.label, icon="FORWARD")
+    for name, value in fix.options.items():
+        setattr(made, name, value)
+
+
+class GIMP3D_PT_scene(StepPanel, bpy.types.Panel):
+    """The splats"""
+
+    bl_idname = "GIMP3D_PT_scene"
+    bl_label = "1  Scene"
+    step = staticmethod(steps.scene_step)
+
+    def choose(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        layout.prop(context.scene.gimp3d, "splat", text="")
+
+    def act(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        if current_splat(context) is not None:
+            row = layout.row(align=True)
+            row.operator("gimp3d.import_ply", text="Import")
+            row.operator("gimp3d.export_ply", text="Export")
+
+
+class GIMP3D_PT_display(Advanced, bpy.types.Panel):
+    """How the splats are shown in Blender"""
+
+    bl_idname = "GIMP3D_PT_display"
+    bl_label = "Display"
+    bl_parent_id = "GIMP3D_PT_scene"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, splat, view = self.layout, current_splat(context), context.space_data
+        if view is not None and view.shading.type in ("SOLID", "WIREFRAME"):
+            say(layout, "Solid view shows no colours:", "INFO")
+        if view is not None:
+            layout.row(align=True).prop(view.shading, "type", expand=True)
+        for name, text in zip(splats.DISPLAY, ("Points in Viewport", "Share of Splats")):
+            found = splats.display_input(splat, name) if splat is not None else None
+            if found is not None:
+                layout.prop(*found, text=text)
+        layout.operator("gimp3d.update_colours")
+        row = layout.row(align=True)
+        row.operator("gimp3d.render_view")
+        row.operator("gimp3d.hide_previews", text="", icon="X")
+        for problem in unfit_settings(context.scene):
+            say(layout, problem, "INFO")
+        if unfit_settings(context.scene):
+            layout.operator("gimp3d.prepare_render")
+
+
+class GIMP3D_PT_region(StepPanel, bpy.types.Panel):
+    """The box round the object"""
+
+    bl_idname = "GIMP3D_PT_region"
+    bl_label = "2  Region"
+    step = staticmethod(steps.region_step)
+
+    def choose(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        for index, roi in enumerate(context.scene.gimp3d.rois):
+            if roi.object is not None:
+                row = layout.row(align=True)
+                row.prop(roi.object, "name", text="", icon="MESH_CUBE")
+                row.operator("gimp3d.forget_roi", text="", icon="X").index = index
+
+    def act(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        layout.label(text="Add Box")
+        row = layout.row(align=True)
+        for fit, _, _, icon, _ in FITS:
+            row.operator("gimp3d.add_roi", text=fit.capitalize(), icon=icon).fit = fit
+        layout.operator("gimp3d.use_selected")
+
+
+class GIMP3D_PT_views(StepPanel, bpy.types.Panel):
+    """From where the scene is looked at"""
+
+    bl_idname = "GIMP3D_PT_views"
+    bl_label = "3  Views"
+    step = staticmethod(steps.views_step)
+
+    def choose(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        settings = context.scene.gimp3d
+        layout.prop(settings, "views", text="")
+        if settings.views == "COLLECTION":
+            layout.prop(settings, "view_collection", text="")
+
+    def act(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        if self.step(context).missing:
+            return
+        row = layout.row(align=True)
+        row.operator("gimp3d.add_views", text="Orbit")
+        row.operator("gimp3d.import_cameras", text="Import")
+        row = layout.row(align=True)
+        row.operator("gimp3d.look_through", text="Previous", icon="TRIA_LEFT").step = -1
+        row.operator("gimp3d.look_through", text="Next", icon="TRIA_RIGHT").step = 1
+
+
+class GIMP3D_PT_remove(InTab, bpy.types.Panel):
+    """Run it"""
+
+    bl_idname = "GIMP3D_PT_remove"
+    bl_label = "4  Remove"
+
+    def draw_header_preset(self, context: bpy.types.Context) -> None:
+        GIMP3D_PT_presets.draw_panel_header(self.layout)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        settings, layout, running = context.scene.gimp3d, self.layout, RunsChild.running
+        layout.prop(settings, "preset", text="")
+        if running is not None:
+            layout.progress(factor=running.worker.progress, text=running.bl_label)
+            say(layout, running.said(context), "TIME")
+            layout.operator("gimp3d.cancel", icon="CANCEL")
+            return
+        self._before(layout, context)
+        if jobs.unfinished(context) is not None:
+            say(layout, "A removal was stopped half-way", "INFO")
+            layout.operator("gimp3d.resume", icon="PLAY")
+        if source_in(context) is not None:
+            row = layout.row(align=True)
+            row.operator("gimp3d.compare", icon="ARROW_LEFTRIGHT")
+            row.operator("gimp3d.restore", icon="LOOP_BACK")
+        if settings.last_report:
+            opened = layout.operator("wm.url_open", text="Open Report", icon="URL")
+            opened.url = Path(bpy.path.abspath(settings.last_report)).as_uri()
+
+    @staticmethod
+    def _before(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+        """What it will cost, and the button; or what to do first."""
+        settings, told = context.scene.gimp3d, steps.forecast(context)
+        panels = (GIMP3D_PT_scene, GIMP3D_PT_region, GIMP3D_PT_views)
+        missing = next(((p.bl_label, p.step(context)) for p in panels if p.step(context).missing), None)
+        if missing is None and told is not None:
+            cost = f"about {duration(told.seconds * settings.pace)}, {told.memory_mb / 1000:.1f} GB"
+            layout.label(text=cost, icon="TIME")
+            if settings.hole:
+                layout.label(text=f"Hole: {settings.hole}", icon="MOD_MASK")
+        if missing is not None:
+            title, step = missing
+            say(layout, f"Step {title[0]} first: {step.missing}", "ERROR")
+            for fix in step.fixes[:1]:
+                button(layout, fix)
+        row = layout.row(align=True)
+        row.enabled = missing is None
+        row.operator("gimp3d.preview_masks", icon="MOD_MASK")
+        row = layout.row()
+        row.enabled, row.scale_y = missing is None, 1.5
+        row.operator("gimp3d.remove_object", icon="TRASH")
+
+
+class GIMP3D_PT_reference(Advanced, bpy.types.Panel):
+    """From where the picture is completed first, and by whom"""
+
+    bl_idname = "GIMP3D_PT_reference"
+    bl_label = "Reference View"
+    bl_parent_id = "GIMP3D_PT_remove"
+
     def draw(self, context: bpy.types.Context) -> None:
         settings, layout = context.scene.gimp3d, self.layout
-        layout.prop(settings, "reference")
+        if settings.reference is None:
+            layout.label(text="Chosen by the program", icon="INFO")
+        layout.prop(settings, "reference", text="")
         layout.operator("gimp3d.choose_reference")
+        layout.label(text="Paint it without the object")
         row = layout.row(align=True)
         row.operator("gimp3d.export_reference", text="Export")
         row.operator("gimp3d.load_reference", text="Load")
+        layout.operator("gimp3d.paint_reference", icon="BRUSH_DATA")
         layout.prop(settings, "reference_image")
-        layout.prop(settings, "inpaint")
-        layout.prop(settings, "depth_prior")
-        layout.prop(settings, "seed")
-        layout.operator("gimp3d.render_view")
+        layout.prop(settings, "reference_paint")
 
 
-CLASSES = (GIMP3D_PT_main, GIMP3D_PT_reference)
+class GIMP3D_PT_fill(Advanced, bpy.types.Panel):
+    """Who invents what no view shows"""
+
+    bl_idname = "GIMP3D_PT_fill"
+    bl_label = "Fill"
+    bl_parent_id = "GIMP3D_PT_remove"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        for name in ("inpaint", "depth_prior", "seed"):
+            self.layout.prop(context.scene.gimp3d, name)
+
+
+class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):
+    """The user's own named settings"""
+
+    bl_label = "Removal Presets"
+    preset_subdir = "gimp3d"
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "gimp3d.add_preset"
+
+
+CLASSES = (
+    GIMP3D_PT_presets,
+    GIMP3D_PT_scene,
+    GIMP3D_PT_display,
+    GIMP3D_PT_region,
+    GIMP3D_PT_views,
+    GIMP3D_PT_remove,
+    GIMP3D_PT_reference,
+    GIMP3D_PT_fill,
+)

@@ -25,6 +25,8 @@ VIEWS = (
     ("COLLECTION", "Collection", "The cameras in one collection are the views"),
     ("ANIMATED", "Animated camera", "Every frame of the active camera is a view"),
 )
+INPAINT = ("exemplar", "shiftmap", "fsr", "telea", "ns")
+SURFACES = ("auto", "harmonic", "planar")
 
 
 class GIMP3D_PG_region(bpy.types.PropertyGroup):
@@ -42,9 +44,15 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="The Gaussian splat object to remove something from",
         poll=lambda _, candidate: splats.is_splat(candidate),
     )
-    rois: CollectionProperty(type=GIMP3D_PG_region, name="Boxes", description="The active cube if empty")
-    views: EnumProperty(items=VIEWS, name="Views", default="ALL")
-    view_collection: PointerProperty(type=bpy.types.Collection, name="Collection")
+    rois: CollectionProperty(
+        type=GIMP3D_PG_region, name="Boxes", description="Boxes round the object; the active cube if empty"
+    )
+    views: EnumProperty(
+        items=VIEWS, name="Views", default="ALL", description="From where the scene is looked at and mended"
+    )
+    view_collection: PointerProperty(
+        type=bpy.types.Collection, name="Collection", description="Its cameras are the views"
+    )
     reference: PointerProperty(
         type=bpy.types.Object,
         name="Reference",
@@ -56,21 +64,40 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="The reference view without the object, painted in any tool",
         subtype="FILE_PATH",
     )
-    preset: EnumProperty(items=PRESETS, name="Preset", default="balanced")
+    preset: EnumProperty(
+        items=PRESETS, name="Preset", default="balanced", description="How much work is spent on the hole"
+    )
+    reference_paint: PointerProperty(
+        type=bpy.types.Image,
+        name="Painted",
+        description="The reference view without the object, painted in Blender's Image Editor",
+    )
     inpaint: StringProperty(
         name="Fill",
         default="exemplar",
-        description="What invents the never-seen part: exemplar, telea, ns, shiftmap, fsr, file:, onnx: or command:",
+        description="What invents the part that no view shows: one of the list, or file:PATH, onnx:PATH or command:CMD",
+        search=lambda _, context, text: INPAINT,
+        search_options={"SUGGESTION"},
     )
     depth_prior: StringProperty(
         name="Surface",
         default="auto",
-        description="How the hidden surface goes on: auto, harmonic, planar, file:PATH",
+        description="How the hidden surface goes on: one of the list, or file:PATH, or onnx:PATH",
+        search=lambda _, context, text: SURFACES,
+        search_options={"SUGGESTION"},
     )
-    seed: IntProperty(name="Seed", default=0, min=0)
-    progress: FloatProperty(min=0, max=1, options={"SKIP_SAVE"})
-    status: StringProperty(options={"SKIP_SAVE"})
-    last_report: StringProperty(name="Report", subtype="FILE_PATH")
+    seed: IntProperty(name="Seed", default=0, min=0, description="Another number invents other details")
+    pace: FloatProperty(
+        name="Pace",
+        default=1.0,
+        min=0.01,
+        description="The last run's time over its forecast: later forecasts are multiplied by it",
+    )
+    hole: StringProperty(name="Hole", description="Size of what was or will be filled, as last measured")
+    last_job: StringProperty(name="Job", subtype="FILE_PATH", description="Folder of the last removal")
+    last_report: StringProperty(
+        name="Report", subtype="FILE_PATH", description="What each stage of the last removal did, as a web page"
+    )
 
 
 class GIMP3D_preferences(bpy.types.AddonPreferences):
@@ -81,11 +108,22 @@ class GIMP3D_preferences(bpy.types.AddonPreferences):
     python: StringProperty(
         name="Python",
         subtype="FILE_PATH",
-        description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with the bundled wheels",
+        description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with what the extension brings",
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.prop(self, "python")
+        from .operators.environment import USES, GIMP3D_OT_check  # it needs this module
+
+        layout = self.layout
+        layout.label(text="Remove runs in a Python of its own, so that Blender stays free.")
+        layout.prop(self, "python")
+        row = layout.row()
+        row.operator("gimp3d.make_environment", icon="IMPORT")
+        row.operator("gimp3d.check", icon="CHECKMARK")
+        for name, version in GIMP3D_OT_check.found.items():
+            there = bool(version) and not version.startswith("broken")
+            text = f"{name} {version or 'missing'}" + (f", {USES[name]}" if name in USES else "")
+            layout.label(text=text, icon="CHECKMARK" if there else "INFO" if name in USES else "ERROR")
 
 
 CLASSES = (GIMP3D_PG_region, GIMP3D_PG_settings, GIMP3D_preferences)

@@ -7,8 +7,9 @@ attributes `scale`, `rotation`, `opacity` and `splat_color` hold activated value
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -16,12 +17,17 @@ from mathutils import Matrix
 
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, Gaussians
-from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, gaussians_of, values
+from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
+from gimp3d.sh import sh_basis
 
+from .native import attribute_values, is_native, read_native, write_native
+
+T = TypeVar("T")
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
 COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
 GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
+DISPLAY = ("As Points", "Fraction")  # inputs of the node group
 EXTENT = 3.0  # standard deviations drawn
 MANY = 200_000  # from here on splats are shown as points unless the user asks otherwise
 UP_AXES = {
@@ -32,8 +38,34 @@ UP_AXES = {
 
 
 def is_splat(candidate: bpy.types.Object | None) -> bool:
-    """Whether an object was made by `create_object`."""
-    return candidate is not None and candidate.type == "MESH" and TABLE in candidate.data
+    """Whether an object was made by `create_object`, or is one of Blender's own splat objects."""
+    ours = candidate is not None and candidate.type == "MESH" and TABLE in candidate.data
+    return ours or is_native(candidate)
+
+
+def count(obj: bpy.types.Object) -> int:
+    """How many splats an object has."""
+    return len(obj.data.vertices) if obj.type == "MESH" else len(obj.data.attributes["position"].data)
+
+
+def kind(obj: bpy.types.Object) -> str:
+    """What an object holds, for the panel."""
+    if is_native(obj):
+        return "Blender's own splats"
+    names = [name for name, _ in json.loads(obj.data[TABLE])["properties"]]
+    degree = round((1 + sum(n.startswith("f_rest_") for n in names) / 3) ** 0.5) - 1
+    return f"{'3DGS' if 'scale_2' in names else '2DGS'}, SH degree {degree}"
+
+
+def positions(obj: bpy.types.Object) -> np.ndarray:
+    """The splats' centres in the object's frame, [N, 3] float32."""
+    return attribute_values(obj.data, "position") if obj.type != "MESH" else _vertices(obj.data)
+
+
+def _vertices(mesh: bpy.types.Mesh) -> np.ndarray:
+    points = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", points)
+    return points.reshape(-1, 3)
 
 
 def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Object:
@@ -43,9 +75,9 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     gaussians = file.gaussians
     mesh.vertices.add(len(gaussians))
     usable = gaussians.usable
-    mesh.vertices.foreach_set("co", _shown_positions(gaussians).ravel())
-    for prop in file.table.properties:
-        _store_raw(mesh, prop, records[prop.name])
+    mesh.vertices.foreach_set("co", np.where(usable[:, None], gaussians.means, 0).ravel())
+    for prop, column in zip(file.table.properties, _columns(records)):
+        _store_raw(mesh, prop, column)
     _store_display(mesh, gaussians, usable)
     table = file.table
     mesh[TABLE] = json.dumps(
@@ -61,12 +93,73 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     obj.matrix_world = matrix
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
-    modifier[_socket("As Points")] = len(gaussians) > MANY
+    set_display(obj, "As Points", len(gaussians) > MANY)
     return obj
+
+
+def create_like(source: bpy.types.Object, name: str, file: SplatFile) -> bpy.types.Object:
+    """A new object (not yet linked) in the source's place and of its kind, shown as the source is."""
+    if is_native(source) and hasattr(source.data, "resize"):  # Blender ≥ 5.2
+        data = source.data.copy()
+        data.resize(len(file.gaussians))
+        write_native(data, file.gaussians)
+        result = bpy.data.objects.new(name, data)
+        result.matrix_world = source.matrix_world.copy()
+        return result
+    result = create_object(name, file, source.matrix_world.copy())
+    for name in DISPLAY if display_input(source, "Fraction") else ():
+        struct, prop = display_input(source, name)
+        set_display(result, name, struct.path_resolve(prop))
+    return result
+
+
+def display_input(obj: bpy.types.Object, name: str) -> tuple[Any, str] | None:
+    """Where a display input lies, as UILayout.prop takes it; None if the user removed the modifier."""
+    group = bpy.data.node_groups.get(GROUP)  # not made here: a panel that is being drawn must change nothing
+    modifier = next((m for m in obj.modifiers if m.type == "NODES" and m.node_group == group), None)
+    if group is None or modifier is None:
+        return None
+    key = next(s.identifier for s in group.interface.items_tree if s.name == name)
+    if hasattr(modifier, "properties"):  # Blender ≥ 5.2
+        return getattr(modifier.properties.inputs, key), "value"
+    return modifier, f'["{key}"]'
+
+
+def set_display(obj: bpy.types.Object, name: str, value: bool | float) -> None:
+    struct, prop = display_input(obj, name)
+    if prop == "value":
+        struct.value = value
+    else:
+        struct[prop[2:-2]] = value
+    obj.update_tag()
+
+
+def show_colours_from(obj: bpy.types.Object, eye: np.ndarray) -> None:
+    """Bake the SH colours as seen from a point in the object's frame: a material can read too few attributes for SH."""
+    gaussians = read_object(obj).gaussians
+    encoded = np.empty((len(gaussians), 3), np.float32)
+    for rows in row_blocks(len(gaussians)):
+        towards = gaussians.means[rows] - np.asarray(eye, np.float32)
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+        basis = sh_basis(towards, gaussians.sh_degree)
+        encoded[rows] = 0.5 + np.einsum("nk,nkc->nc", basis, gaussians.sh[rows])
+    colours = _shown_colours(encoded)
+    colours[~gaussians.usable] = 0
+    obj.data.attributes[COLOUR].data.foreach_set("color", colours.ravel())
+    obj.data.update_tag()
+
+
+def _shown_colours(encoded: np.ndarray) -> np.ndarray:
+    """Gamma-encoded colours as Blender's linear ones with alpha, [N, 4] float32."""
+    encoded = np.clip(encoded, 0, 1)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
 
 
 def read_object(obj: bpy.types.Object) -> SplatFile:
     """The file that an object came from, without the vertices that were deleted since."""
+    if is_native(obj):
+        return file_of(read_native(obj.data))
     if obj.mode == "EDIT":  # there the mesh shows no attributes; a copy of it does
         obj.update_from_editmode()
         copy = obj.data.copy()
@@ -82,9 +175,12 @@ def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
     properties = tuple(PlyProperty(*p) for p in stored["properties"])
     header = tuple(stored["header"])
     empty = PlyTable(header, stored["line_end"], stored["format"], properties, np.zeros(0, "V1"))
-    records = np.zeros(len(mesh.vertices), empty.dtype)
-    for prop in properties:
-        records[prop.name] = _load_raw(mesh, prop, records.dtype[prop.name].newbyteorder("="))
+    records = np.empty(len(mesh.vertices), empty.dtype)
+    for group in _groups(properties):
+        columns = [_load_raw(mesh, p, empty.dtype[p.name].newbyteorder("=")) for p in group]
+        for rows in row_blocks(len(records)):
+            for prop, column in zip(group, columns):
+                records[prop.name][rows] = column[rows]
     if stored["format"] == "ascii":
         rows = np.empty(len(records), object)
         rows[:] = ascii_rows(records)
@@ -98,14 +194,8 @@ def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
 
 def _refuse_moved(mesh: bpy.types.Mesh, gaussians: Gaussians) -> None:
     """After Apply Transform the mesh is no longer in the file's frame, and cameras and boxes would miss it."""
-    shown = np.empty(3 * len(gaussians), np.float32)
-    mesh.vertices.foreach_get("co", shown)
-    if not np.array_equal(shown.reshape(-1, 3), _shown_positions(gaussians)):
+    if not np.array_equal(_vertices(mesh), np.where(gaussians.usable[:, None], gaussians.means, 0)):
         raise BadInput(f"{mesh.name}: vertices were moved, or a transform was applied; undo that and move the object")
-
-
-def _shown_positions(gaussians: Gaussians) -> np.ndarray:
-    return np.where(gaussians.usable[:, None], gaussians.means, 0).astype(np.float32)
 
 
 def _vertex_header(header: Sequence[str]) -> list[str]:
@@ -118,6 +208,21 @@ def _vertex_header(header: Sequence[str]) -> list[str]:
         if words[0] not in ("element", "property") or element == "vertex":
             kept.append(line)
     return kept
+
+
+def _columns(records: np.ndarray) -> Iterator[np.ndarray]:
+    """Each field of records [N] as an array of its own."""
+    for group in _groups(records.dtype.names or ()):
+        columns = [np.empty(len(records), records.dtype[name]) for name in group]
+        for rows in row_blocks(len(records)):
+            for name, column in zip(group, columns):
+                column[rows] = records[name][rows]
+        yield from columns
+
+
+def _groups(fields: Sequence[T]) -> Iterator[Sequence[T]]:
+    """As many fields as share a cache line: memory is read once for all of them, and little of it is needed."""
+    return (fields[k : k + 16] for k in range(0, len(fields), 16))
 
 
 def _words(kind: np.dtype) -> int:
@@ -143,9 +248,9 @@ def _load_raw(mesh: bpy.types.Mesh, prop: PlyProperty, kind: np.dtype) -> np.nda
     for k, name in enumerate(names):
         column = np.empty(len(mesh.vertices), columns.dtype)
         mesh.attributes[name].data.foreach_get("value", column)
+        if kind == np.float32:
+            return column
         columns[:, k] = column
-    if kind == np.float32:
-        return columns[:, 0]
     return np.ascontiguousarray(columns.view(np.uint8)[:, : kind.itemsize]).view(kind)[:, 0]
 
 
@@ -155,15 +260,12 @@ def _store_display(mesh: bpy.types.Mesh, gaussians: Gaussians, usable: np.ndarra
         scales = np.concatenate([scales, 1e-3 * scales.min(1, keepdims=True)], axis=1)
     norms = np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
     quats = gaussians.quats / np.where(norms > 0, norms, 1)
-    encoded = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0], 0, 1)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     hide = ~usable
-    shown = np.concatenate([linear, np.ones((len(linear), 1))], axis=1)
     for name, kind, key, array in (
         ("scale", "FLOAT_VECTOR", "vector", scales),
         ("rotation", "QUATERNION", "value", quats),
         ("opacity", "FLOAT", "value", gaussians.opacity),
-        (COLOUR, "FLOAT_COLOR", "color", shown),
+        (COLOUR, "FLOAT_COLOR", "color", _shown_colours(0.5 + SH_C0 * gaussians.sh[:, 0])),
     ):
         clean = np.array(array, np.float32)
         clean[hide] = 0
@@ -194,7 +296,7 @@ def node_group() -> bpy.types.NodeTree:
     lottery.data_type = "FLOAT"
     chosen = node("FunctionNodeCompare")
     chosen.data_type, chosen.operation = "FLOAT", "LESS_EQUAL"
-    link(lottery.outputs[1], chosen.inputs["A"])
+    link(lottery.outputs["Value"], chosen.inputs["A"])
     link(source.outputs["Fraction"], chosen.inputs["B"])
 
     ball = node("GeometryNodeMeshIcoSphere")
@@ -233,10 +335,6 @@ def node_group() -> bpy.types.NodeTree:
     link(coloured.outputs["Geometry"], choice.inputs["True"])
     link(choice.outputs["Output"], target.inputs["Geometry"])
     return tree
-
-
-def _socket(name: str) -> str:
-    return next(s.identifier for s in node_group().interface.items_tree if s.name == name)
 
 
 def _named(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import json
 import queue
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gimp3d
 from gimp3d.errors import BadInput, Gimp3dError
+from gimp3d.forecast import Clock
 
 # The core's folder comes last on the path: a chosen Python uses its own NumPy, numba and OpenCV. The folder that
 # Blender was started in comes off it, as a user's numpy.py there must not be imported.
@@ -40,14 +43,34 @@ entry_point()
 def child_command(arguments: Sequence[str], python: str = "") -> list[str]:
     """The command line that runs `gimp3d arguments` in a chosen Python, or in Blender's own."""
     folder = Path(gimp3d.__file__).resolve().parents[1]
-    return [python or sys.executable, "-X", "utf8", "-c", BOOT, str(folder), *arguments]
+    return [python or own_python(), "-X", "utf8", "-c", BOOT, str(folder), *arguments]
+
+
+def own_python() -> str:
+    """Blender's own interpreter; in some builds `sys.executable` is Blender itself."""
+    if Path(sys.executable).name.lower().startswith("python"):
+        return sys.executable
+    found = shutil.which(f"python{sys.version_info[0]}.{sys.version_info[1]}", path=str(Path(sys.prefix) / "bin"))
+    if found is None:
+        raise BadInput("Blender's own Python was not found; choose one in the preferences of 3D-GIMP")
+    return found
+
+
+class Killed(Gimp3dError):
+    """The child was ended from outside, so what it was doing can be gone on with."""
 
 
 class Worker:
-    """One `gimp3d` command in a child process; `poll` takes its progress, `cancel` ends it at once."""
+    """One `gimp3d` command (or any other) in a child process; `poll` takes its progress, `cancel` ends it at once."""
 
-    def __init__(self, arguments: Sequence[str], python: str = "") -> None:
-        command = child_command(arguments, python)
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        python: str = "",
+        clock: Clock | None = None,  # of a removal: turns stages into one bar and the time left
+        command: Sequence[str] | None = None,  # instead of gimp3d
+    ) -> None:
+        command = command or child_command(arguments, python)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115, lives as long as the child
         try:
             self._process = subprocess.Popen(
@@ -65,8 +88,11 @@ class Worker:
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+        self._clock, self._started = clock, time.monotonic()
         self.progress = 0.0
         self.status = "starting"
+        self.cancelled = False
+        self.compiled = False  # the first run on a machine: its time says nothing of the next one's
         self.summary: dict[str, Any] | None = None
         self._error = ""
 
@@ -80,16 +106,20 @@ class Worker:
                 break
         return ended and self._process.poll() is not None
 
-    def wait(self, tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-        """Run to the end; returns the summary ({} for commands without one), raises like `result`."""
+    def join(self) -> None:
+        """Wait for the end, however it comes."""
         self._reader.join()
         self._process.wait()
         self.poll()
-        tell(self.status)
+
+    def wait(self) -> dict[str, Any]:
+        """Run to the end; returns the summary ({} for commands without one), raises like `result`."""
+        self.join()
         return self.result()
 
     def cancel(self) -> None:
         """End the child now; its finished stages stay in the job folder."""
+        self.cancelled = True
         self._process.terminate()
         try:
             self._process.wait(timeout=0.8)
@@ -111,9 +141,17 @@ class Worker:
         self._errors.seek(0)
         said = self._errors.read().strip().splitlines()
         line = self._error or next((s for s in reversed(said) if s.strip()), "")
-        if code < 0 and not self._error:
-            line = f"the removal was ended by signal {-code} (out of memory?); it can be resumed from its job folder"
-        raise Gimp3dError(line.removeprefix("gimp3d: error: ") or f"the removal ended with code {code}")
+        if not self._error and (code < 0 or not line):
+            cause = f"signal {-code}" if code < 0 else f"code {code}"
+            raise Killed(f"the work was ended from outside ({cause}; out of memory?); a removal can be resumed")
+        raise Gimp3dError(line.removeprefix("gimp3d: error: "))
+
+    def words(self, pace: float = 1.0) -> str:
+        """What to show: the stage and, of a removal, the time left."""
+        if self._clock is None:
+            return self.status
+        left = self._clock.seconds_left(time.monotonic() - self._started, pace)
+        return f"{self.status} · about {duration(left)} left"
 
     def _read(self) -> None:
         assert self._process.stdout is not None
@@ -133,4 +171,15 @@ class Worker:
             self._error = said["message"]
         elif "done" in said:
             self.progress = said["done"] / max(1, said["total"])
-            self.status = f"{said['stage']} {said['done']}/{said['total']} {said.get('message', '')}".strip()
+            self.status = said["stage"] if said["total"] == 1 else f"{said['stage']} {said['done']}/{said['total']}"
+            self.compiled = self.compiled or said["stage"] == "compile"
+            if self._clock is not None:
+                self._clock.take(said["stage"], said["done"], said["total"])
+                self.progress = self._clock.fraction
+
+
+def duration(seconds: float) -> str:
+    """A time in words of the right size."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,9 +1,10 @@
 """Build the Blender extension: dist/gimp3d-<version>-<platform>.zip with the core and its compiled wheels inside.
 
-Stages the manifest, the add-on and the wheels, and lets Blender's own builder make and validate the zip. NumPy is never
-bundled: Blender brings its own. By default for this machine's platform and Python.
+Stages the manifest, the add-on and the wheels, and lets Blender's own builder make and validate the zips: one for each
+platform, with wheels for both Pythons that Blender carries; Blender installs those that fit. NumPy is never bundled, as
+Blender brings its own, nor is PyTorch, which is too large: the preferences make an environment that has it.
 
-    python scripts/build_extension.py [--without-compiled-wheels]
+    python scripts/build_extension.py [--platform linux-x64] … [--without-compiled-wheels]
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 DIST = ROOT / "dist"
 BUNDLED = ("numba", "llvmlite", "scipy", "opencv-contrib-python-headless")
-TAGS = {
-    ("Linux", "x86_64"): "linux-x64",
-    ("Linux", "aarch64"): "linux-arm64",
-    ("Windows", "AMD64"): "windows-x64",
-    ("Darwin", "arm64"): "macos-arm64",
+PYTHONS = ("3.11", "3.13")  # Blender 4.2 to 5.0, and from 5.1 on
+PLATFORMS = {  # Blender's name → the tags that wheels for it may have
+    "linux-x64": ("manylinux2014_x86_64", "manylinux_2_27_x86_64", "manylinux_2_28_x86_64"),
+    "windows-x64": ("win_amd64",),
+    "macos-arm64": ("macosx_11_0_arm64", "macosx_12_0_arm64", "macosx_13_0_arm64", "macosx_14_0_arm64"),
 }
+HERE = {("Linux", "x86_64"): "linux-x64", ("Windows", "AMD64"): "windows-x64", ("Darwin", "arm64"): "macos-arm64"}
 ENTRY = '''"""3D-GIMP, installed as a Blender extension."""
 
 from .gimp3d_addon import register, unregister
@@ -37,30 +39,37 @@ __all__ = ["register", "unregister"]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--platform", action="append", choices=(*PLATFORMS, "here"), help="default: all of them")
     parser.add_argument("--without-compiled-wheels", action="store_true", help="small zip; needs a chosen Python")
     given = parser.parse_args()
-    tag = TAGS.get((platform.system(), platform.machine()))
-    if tag is None:
+    here = HERE.get((platform.system(), platform.machine()), "")
+    chosen = [here if p == "here" else p for p in given.platform or PLATFORMS]
+    if "" in chosen:
         sys.exit(f"build_extension: Blender has no extension platform for {platform.system()} {platform.machine()}")
     DIST.mkdir(exist_ok=True)
+    for tag in chosen:
+        build(tag, compiled=not given.without_compiled_wheels)
+
+
+def build(tag: str, compiled: bool) -> None:
+    """Stage, build and validate one platform's zip."""
     with tempfile.TemporaryDirectory(prefix="gimp3d-stage-") as folder:
         stage = Path(folder)
         shutil.copytree(ROOT / "gimp3d_addon", stage / "gimp3d_addon", ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy2(ROOT / "LICENSE", stage)
         (stage / "__init__.py").write_text(ENTRY)
-        wheels = collect_wheels(stage / "wheels", compiled=not given.without_compiled_wheels)
+        wheels = collect_wheels(stage / "wheels", tag if compiled else "")
         for wheel in sorted(wheels, key=lambda w: -w.stat().st_size):
             print(f"{wheel.stat().st_size / 2**20:8.1f} MiB  {wheel.name}")
         version = write_manifest(stage / "blender_manifest.toml", wheels, tag)
-        light = "-light" if given.without_compiled_wheels else ""
-        target = DIST / f"gimp3d-{version}-{tag}{light}.zip"
+        target = DIST / f"gimp3d-{version}-{tag}{'' if compiled else '-light'}.zip"
         blender("build", "--source-dir", str(stage), "--output-filepath", str(target))
     blender("validate", str(target))
-    print(f"{target.stat().st_size / 2**20:8.1f} MiB  {target.relative_to(ROOT)}")
+    print(f"{target.stat().st_size / 2**20:8.1f} MiB  {target.relative_to(ROOT)}", flush=True)
 
 
-def collect_wheels(folder: Path, compiled: bool) -> list[Path]:
-    """Our own wheel and, on request, the compiled ones for this platform and Python, in the tested versions."""
+def collect_wheels(folder: Path, tag: str) -> list[Path]:
+    """Our own wheel and, for a platform, the compiled ones for both Pythons, in the tested versions."""
     folder.mkdir()
     source = folder.parent / "source"  # a copy, so that the build leaves nothing in the checkout
     shutil.copytree(ROOT / "core", source / "core", ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
@@ -68,9 +77,10 @@ def collect_wheels(folder: Path, compiled: bool) -> list[Path]:
         shutil.copy2(ROOT / name, source)
     pip("wheel", "--no-deps", "--wheel-dir", str(folder), str(source))
     shutil.rmtree(source)
-    if compiled:
-        constraints = ["--constraint", str(ROOT / "constraints.txt")]
-        pip("download", "--only-binary=:all:", "--no-deps", *constraints, "--dest", str(folder), *BUNDLED)
+    for python in PYTHONS if tag else ():
+        tags = [option for name in PLATFORMS[tag] for option in ("--platform", name)]
+        pinned = ["--constraint", str(ROOT / "constraints.txt"), "--python-version", python, *tags]
+        pip("download", "--only-binary=:all:", "--no-deps", *pinned, "--dest", str(folder), *BUNDLED)
     return sorted(folder.glob("*.whl"))
 
 
@@ -89,7 +99,9 @@ def blender(*arguments: str) -> None:
     if found is None or found.origin is None:
         sys.exit("build_extension: the bpy module is missing; run make setup")
     tool = next(Path(found.origin).parent.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"))
-    subprocess.run([sys.executable, str(tool), *arguments], check=True, stdout=subprocess.DEVNULL)
+    done = subprocess.run([sys.executable, str(tool), *arguments], capture_output=True, text=True)
+    if done.returncode or "warning" in done.stdout.lower():
+        sys.exit(f"build_extension: Blender's own tool says\n{done.stdout}{done.stderr}")
 
 
 def pip(*arguments: str) -> None:

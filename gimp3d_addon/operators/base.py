@@ -1,16 +1,22 @@
-"""What every operator does with an error: one line to the user, CANCELLED to the caller (a RuntimeError in scripts)."""
+"""What every operator does: find the scene's objects, run the core in a child, and say a failure in one line.
+
+A failure is one line to the user, CANCELLED to the caller (a RuntimeError in scripts).
+"""
 
 from __future__ import annotations
 
 import bpy
 
-from gimp3d.errors import Gimp3dError
+from gimp3d.errors import BadInput, Gimp3dError
 
 from .. import splats
 from ..bridge import present
 from ..properties import preferences
+from ..worker import Worker
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
+AGAIN = {"PASS_THROUGH"}  # another child follows
+TICK = 0.1  # s between two looks at the child's progress
 
 
 def one_line(error: Exception) -> str:
@@ -28,6 +34,132 @@ class ReportsErrors:
         except FAILURES as error:
             self.report({"ERROR"}, one_line(error))
             return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class RunsChild:
+    """Mixin: `start` prepares files and starts a child, `collect` takes its result, beside a Blender that stays free.
+
+    `execute` (scripts, background) waits for the end. In the window Esc or the panel's button cancels at once.
+    """
+
+    running: RunsChild | None = None  # the one that runs beside Blender now; two would fight for the processor
+    worker: Worker
+    _shown = ""
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        """Write what the child needs and start it."""
+        raise NotImplementedError
+
+    def collect(self, context: bpy.types.Context) -> Worker | None:
+        """Take the result of a child that ended; may start another one, and is then called again."""
+        raise NotImplementedError
+
+    def tidy(self) -> None:
+        """Whatever the end: files that nobody needs any more."""
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if RunsChild.running is not None:
+            self.report(
+                {"ERROR"}, one_line(BadInput(f"{RunsChild.running.bl_label} is still running; cancel it first"))
+            )
+            return {"CANCELLED"}
+        try:
+            self.worker = self.start(context)
+        except FAILURES as error:
+            return self._failed(error)
+        answer = AGAIN
+        while answer == AGAIN:
+            self.worker.join()
+            answer = self._end(context)
+        return answer
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if bpy.app.background or RunsChild.running is not None:
+            return self.execute(context)
+        try:
+            self.worker = self.start(context)
+        except FAILURES as error:
+            return self._failed(error)
+        self._go(context)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type == "ESC":
+            self.worker.cancel()
+        elif event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        ended = self.worker.poll()
+        said = self.said(context)
+        if said != self._shown:  # drawing takes time too
+            self._shown = said
+            context.workspace.status_text_set(f"3D-GIMP: {said} (Esc cancels)")
+            for area in context.window.screen.areas:
+                for region in area.regions:
+                    if region.type == "UI":  # the panel, not the view
+                        region.tag_redraw()
+        if not (ended or self.worker.cancelled):
+            return {"PASS_THROUGH"}
+        self._stop(context)
+        answer = self._end(context)
+        if answer == AGAIN:
+            self._go(context)
+        return answer
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Blender ends the operator: another file is opened, or the window closes."""
+        self.worker.cancel()
+        self._stop(context)
+        self.tidy()
+
+    def said(self, context: bpy.types.Context) -> str:
+        """The child's progress in words."""
+        return self.worker.words(context.scene.gimp3d.pace)
+
+    def _go(self, context: bpy.types.Context) -> None:
+        RunsChild.running = self
+        self._timer = context.window_manager.event_timer_add(TICK, window=context.window)
+
+    def _stop(self, context: bpy.types.Context) -> None:
+        RunsChild.running = None
+        context.window_manager.event_timer_remove(self._timer)
+        context.workspace.status_text_set(None)
+
+    def _end(self, context: bpy.types.Context) -> set[str]:
+        if self.worker.cancelled:
+            self.tidy()
+            self.report({"INFO"}, "cancelled; the scene is as it was")
+            return {"CANCELLED"}
+        try:
+            following = self.collect(context)
+        except FAILURES as error:
+            return self._failed(error)
+        if following is not None:
+            self.worker = following
+            return AGAIN
+        self.tidy()
+        return {"FINISHED"}
+
+    def _failed(self, error: Exception) -> set[str]:
+        self.tidy()
+        self.report({"ERROR"}, one_line(error))
+        return {"CANCELLED"}
+
+
+class GIMP3D_OT_cancel(bpy.types.Operator):
+    """Stop what is running now; the scene stays as it was"""
+
+    bl_idname = "gimp3d.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Nothing is running")
+        return RunsChild.running is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        RunsChild.running.worker.cancel()
         return {"FINISHED"}
 
 
@@ -55,6 +187,16 @@ def link(context: bpy.types.Context, obj: bpy.types.Object, collection: bpy.type
     (collection or context.collection or context.scene.collection).objects.link(obj)
 
 
+def select_only(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    for other in context.selected_objects:
+        other.select_set(False)
+    obj.select_set(True)
+    context.view_layer.objects.active = obj
+
+
 def python_of(context: bpy.types.Context) -> str:
     chosen = preferences(context)
     return bpy.path.abspath(chosen.python) if chosen and chosen.python else ""
+
+
+CLASSES = (GIMP3D_OT_cancel,)

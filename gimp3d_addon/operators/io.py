@@ -14,7 +14,7 @@ from gimp3d.io.formats import read_scene
 from gimp3d.io.ply import write_ply
 
 from .. import splats
-from .base import ReportsErrors, current_splat, link
+from .base import ReportsErrors, current_splat, link, select_only
 
 UP_ITEMS = (
     ("FILE", "As in the file", "Keep the file's axes"),
@@ -31,8 +31,14 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
     bl_options = {"REGISTER", "UNDO"}
     filename_ext = ".ply"
 
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})  # a dropped file must not be the next default
     filter_glob: StringProperty(default="*.ply;*.splat;*.spz;*.sog;meta.json", options={"HIDDEN"})
     up: EnumProperty(items=UP_ITEMS, name="Up", default="FILE", description="Goes into the object's matrix only")
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not self.properties.is_property_set("filepath"):
+            return ImportHelper.invoke(self, context, event)
+        return context.window_manager.invoke_props_dialog(self, title=Path(self.filepath).name)  # dropped: ask for Up
 
     def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
@@ -41,12 +47,9 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
             self.report({"WARNING"}, "elements other than vertex are not kept")
         obj = splats.create_object(splats.default_name(path), file, splats.UP_AXES[self.up])
         link(context, obj)
-        for other in context.selected_objects:
-            other.select_set(False)
-        obj.select_set(True)
-        context.view_layer.objects.active = obj
+        select_only(context, obj)
         context.scene.gimp3d.splat = obj
-        self.report({"INFO"}, f"{len(file.gaussians)} Gaussians, SH degree {file.gaussians.sh_degree}")
+        self.report({"INFO"}, f"{len(file.gaussians):,} Gaussians, SH degree {file.gaussians.sh_degree}")
 
 
 class GIMP3D_OT_export_ply(ReportsErrors, bpy.types.Operator, ExportHelper):
@@ -72,15 +75,28 @@ class GIMP3D_OT_export_ply(ReportsErrors, bpy.types.Operator, ExportHelper):
         write_ply(Path(bpy.path.abspath(self.filepath)), file, np.ones(len(file.gaussians), bool))
 
 
+class GIMP3D_FH_splats(bpy.types.FileHandler):
+    """Splat files dropped into the 3D view"""
+
+    bl_idname = "GIMP3D_FH_splats"
+    bl_label = "Gaussian Splats, 3D-GIMP"
+    bl_import_operator = "gimp3d.import_ply"
+    bl_file_extensions = ".ply;.splat;.spz;.sog"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
 def _menu_import(self: bpy.types.Menu, context: bpy.types.Context) -> None:
-    self.layout.operator(GIMP3D_OT_import_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply)")
+    self.layout.operator(GIMP3D_OT_import_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply, .splat, .spz, .sog)")
 
 
 def _menu_export(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     self.layout.operator(GIMP3D_OT_export_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply)")
 
 
-CLASSES = (GIMP3D_OT_import_ply, GIMP3D_OT_export_ply)
+CLASSES = (GIMP3D_OT_import_ply, GIMP3D_OT_export_ply, GIMP3D_FH_splats)
 
 
 def register() -> None:

@@ -16,9 +16,12 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob
 
-from .. import bridge, jobs, splats
+from .. import backdrops, bridge, jobs, splats
 from ..worker import Worker
-from .base import ReportsErrors, current_boxes, current_splat, python_of
+from .base import ReportsErrors, RunsChild, current_boxes, current_splat, python_of
+
+PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior"}
+VIEW = "view"  # ID of the one camera that is drawn
 
 
 def _camera(context: bpy.types.Context) -> bpy.types.Object:
@@ -28,38 +31,52 @@ def _camera(context: bpy.types.Context) -> bpy.types.Object:
     return found
 
 
-def _passing_folder() -> tempfile.TemporaryDirectory[str]:
-    """Not a job folder: what lies here is read into the .blend at once, and scenes are large."""
-    return tempfile.TemporaryDirectory(prefix="gimp3d-")
+class RunsInPassing(RunsChild):
+    """Mixin: a child in a folder that goes with it: what it makes is read into the .blend, and scenes are large."""
+
+    _folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def new_folder(self) -> Path:
+        self._folder = tempfile.TemporaryDirectory(prefix="gimp3d-")
+        return Path(self._folder.name)
+
+    def tidy(self) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
 
 
-def _prepared(context: bpy.types.Context, folder: Path) -> tuple[RemovalJob, str]:
-    """The scene as it is as a job, and the ID of the reference (else active) camera in it."""
-    camera = _camera(context)
+def _draw(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) -> Worker:
+    """Draws the splats as they really look from a camera into `folder`/view.png."""
+    splat = current_splat(context)
+    context.view_layer.update()
+    frame = bridge.splat_frame(splat)
+    view = bridge.camera_from_blender(camera, frame, context.scene, context.evaluated_depsgraph_get(), VIEW)
+    file = splats.read_object(splat)
+    ply, cameras = folder / "scene.ply", folder / "transforms.json"
+    write_ply(ply, file, np.ones(len(file.gaussians), bool))
+    write_transforms(cameras, [view])
+    arguments = ["render", str(ply), "--cameras", str(cameras), "--out", str(folder), "--progress", "json"]
+    return Worker(arguments, python_of(context))
+
+
+def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) -> tuple[Worker, str]:
+    """Draws what a removal would fill in a view, and on what surface; returns the view's ID too."""
     settings = context.scene.gimp3d
     chosen, settings.reference = settings.reference, camera  # the camera must be among the job's views
     try:
-        job = jobs.write_job(context, folder, with_photos=False)
+        job: RemovalJob = jobs.write_job(context, folder, with_photos=False)
     finally:
         settings.reference = chosen
     if not job.reference:
         raise BadInput(f"camera {camera.name} is not among the views")
-    return job, job.reference
-
-
-def _run(context: bpy.types.Context, *arguments: str) -> None:
-    Worker([*arguments, "--progress", "none"], python_of(context)).wait()
-
-
-def _picture(path: Path, name: str) -> bpy.types.Image:
-    if not path.exists():
-        raise BadInput(f"{path.name} was not made")
-    if name in bpy.data.images:
-        bpy.data.images.remove(bpy.data.images[name])
-    image = bpy.data.images.load(str(path))
-    image.name = name
-    image.pack()
-    return image
+    mode = "paper" if job.preset == "paper" else "need"
+    arguments = [
+        "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
+        "--frames", job.reference, "--mode", mode, "--depth-prior", job.depth_prior,
+        "--pictures", str(folder / "pictures"), "--progress", "json",
+    ]  # fmt: skip
+    return Worker(arguments, python_of(context)), _stem(job.reference)
 
 
 def _stem(camera_id: str) -> str:
@@ -68,64 +85,79 @@ def _stem(camera_id: str) -> str:
     return f"{folder}/{stem}" if folder else stem
 
 
-class GIMP3D_OT_render_view(ReportsErrors, bpy.types.Operator):
-    """Draw the splats as they really look from the active camera, into the image '3D-GIMP view'"""
+class GIMP3D_OT_render_view(RunsInPassing, bpy.types.Operator):
+    """Draw the splats as they really look from the active camera: over its view and in the image '3D-GIMP view'"""
 
     bl_idname = "gimp3d.render_view"
-    bl_label = "Render View"
+    bl_label = "Show True Picture"
+    bl_options = {"UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene and add a camera first")
+        cls.poll_message_set("Import a splat scene and make a camera active first")
         return current_splat(context) is not None and context.scene.camera is not None
 
-    def work(self, context: bpy.types.Context) -> None:
-        splat, camera = current_splat(context), context.scene.camera
-        context.view_layer.update()
-        frame = bridge.splat_frame(splat)
-        view = bridge.camera_from_blender(camera, frame, context.scene, context.evaluated_depsgraph_get(), "view")
-        file = splats.read_object(splat)
-        with _passing_folder() as name:
-            ply, cameras = Path(name, "scene.ply"), Path(name, "transforms.json")
-            write_ply(ply, file, np.ones(len(file.gaussians), bool))
-            write_transforms(cameras, [view])
-            _run(context, "render", str(ply), "--cameras", str(cameras), "--out", name)
-            _picture(Path(name, "view.png"), "3D-GIMP view")
+    def start(self, context: bpy.types.Context) -> Worker:
+        self._camera = context.scene.camera.name
+        return _draw(context, context.scene.camera, self.new_folder())
+
+    def collect(self, context: bpy.types.Context) -> None:
+        self.worker.result()
+        image = backdrops.load_picture(Path(self._folder.name, f"{VIEW}.png"), VIEW)
+        _show(context, self._camera, image)
 
 
-PREVIEWS = {"mask": "3D-GIMP hole", "depth": "3D-GIMP surface", "fit": "3D-GIMP depth prior"}
+def _show(context: bpy.types.Context, camera: str, image: bpy.types.Image) -> None:
+    obj = context.scene.objects.get(camera)
+    if obj is not None:
+        backdrops.put_over(obj, image)
+    backdrops.show_in_image_editor(context, image)
 
 
-class GIMP3D_OT_preview_masks(ReportsErrors, bpy.types.Operator):
-    """Show what will be filled in the reference (or active) camera and on what surface, as images '3D-GIMP …'"""
+class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
+    """Show over the reference (else active) camera's view what will be filled; also as images '3D-GIMP …'"""
 
     bl_idname = "gimp3d.preview_masks"
     bl_label = "Preview Mask"
+    bl_options = {"UNDO"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Import a splat scene and put a box round the object first")
         return current_splat(context) is not None and bool(current_boxes(context))
 
+    def start(self, context: bpy.types.Context) -> Worker:
+        camera = _camera(context)
+        self._camera = camera.name
+        worker, self._stem = _look(context, camera, self.new_folder())
+        return worker
+
+    def collect(self, context: bpy.types.Context) -> None:
+        self.worker.result()
+        folder = Path(self._folder.name)
+        mask = backdrops.load_picture(folder / "masks" / f"{self._stem}.png", "mask")
+        shown, pixels = mask, np.empty(4 * mask.size[0] * mask.size[1], np.float32)
+        mask.pixels.foreach_get(pixels)
+        context.scene.gimp3d.hole = f"{np.count_nonzero(pixels[::4] > 0.5):,} pixels in {self._camera}"
+        for kind, title in PREVIEWS.items():
+            drawn = folder / "pictures" / f"{self._stem}.{kind}.png"
+            if drawn.exists():
+                image = backdrops.load_picture(drawn, title)
+                shown = image if kind == "mask" else shown
+        _show(context, self._camera, shown)
+
+
+class GIMP3D_OT_hide_previews(ReportsErrors, bpy.types.Operator):
+    """Take the previews and true pictures off all cameras; photos stay"""
+
+    bl_idname = "gimp3d.hide_previews"
+    bl_label = "Hide Previews"
+    bl_options = {"REGISTER", "UNDO"}
+
     def work(self, context: bpy.types.Context) -> None:
-        with _passing_folder() as name:
-            folder = Path(name)
-            job, camera = _prepared(context, folder)
-            pictures = folder / "pictures"
-            _picture(_mask(context, folder, job, camera, "--pictures", str(pictures)), "3D-GIMP mask")
-            for kind, title in PREVIEWS.items():
-                drawn = pictures / f"{_stem(camera)}.{kind}.png"
-                if drawn.exists():
-                    _picture(drawn, title)
-
-
-def _mask(context: bpy.types.Context, folder: Path, job: RemovalJob, name: str, *more: str) -> Path:
-    mode = "paper" if job.preset == "paper" else "need"
-    _run(
-        context, "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
-        "--frames", name, "--mode", mode, "--depth-prior", job.depth_prior, *more,
-    )  # fmt: skip
-    return folder / "masks" / f"{_stem(name)}.png"
+        for obj in context.scene.objects:
+            if obj.type == "CAMERA":
+                backdrops.take_away(obj)
 
 
 class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
@@ -148,30 +180,70 @@ class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
         context.scene.gimp3d.reference = found
 
 
-class GIMP3D_OT_export_reference(ReportsErrors, bpy.types.Operator, ExportHelper):
-    """Write the reference view and, beside it, the mask of what to paint; edit it in any tool and load it back"""
+class RunsReference(RunsInPassing):
+    """Mixin: a child for the mask, then one for the picture of the reference view; `deliver` takes both files."""
 
-    bl_idname = "gimp3d.export_reference"
-    bl_label = "Export Reference"
-    filename_ext = ".png"
+    _drawing = False
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Import a splat scene and put a box round the object first")
         return current_splat(context) is not None and bool(current_boxes(context))
 
-    def work(self, context: bpy.types.Context) -> None:
+    def start(self, context: bpy.types.Context) -> Worker:
+        camera = _camera(context)
+        self._camera, folder = camera.name, self.new_folder()
+        worker, self._stem = _look(context, camera, folder)
+        return worker
+
+    def collect(self, context: bpy.types.Context) -> Worker | None:
+        self.worker.result()
+        folder = Path(self._folder.name)
+        camera = context.scene.objects.get(self._camera)
+        if camera is None:
+            raise BadInput(f"camera {self._camera} is no longer in the scene")
+        if not self._drawing:
+            self._drawing = True
+            return _draw(context, camera, folder)
+        context.scene.gimp3d.reference = camera
+        self.deliver(context, folder / f"{VIEW}.png", folder / "masks" / f"{self._stem}.png")
+        return None
+
+    def deliver(self, context: bpy.types.Context, picture: Path, mask: Path) -> None:
+        raise NotImplementedError
+
+
+class GIMP3D_OT_export_reference(RunsReference, bpy.types.Operator, ExportHelper):
+    """Write the reference view and, beside it, the mask of what to paint; edit it in any tool and load it back"""
+
+    bl_idname = "gimp3d.export_reference"
+    bl_label = "Export Reference"
+    filename_ext = ".png"
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return ExportHelper.invoke(self, context, event)  # the file browser first; then execute waits
+
+    def deliver(self, context: bpy.types.Context, picture: Path, mask: Path) -> None:
         target = Path(bpy.path.abspath(self.filepath))
-        mask = target.with_name(f"{target.stem}.mask.png")
+        beside = target.with_name(f"{target.stem}.mask.png")
         target.parent.mkdir(parents=True, exist_ok=True)
-        with _passing_folder() as folder:
-            job, name = _prepared(context, Path(folder))
-            shutil.copyfile(_mask(context, Path(folder), job, name), mask)
-            out = Path(folder, "render")
-            _run(context, "render", job.scene, "--cameras", job.cameras, "--out", str(out), "--frames", name)
-            shutil.copyfile(out / f"{_stem(name)}.png", target)
-        context.scene.gimp3d.reference = _camera(context)
-        self.report({"INFO"}, f"{target.name} and {mask.name} written")
+        shutil.copyfile(picture, target)
+        shutil.copyfile(mask, beside)
+        self.report({"INFO"}, f"{target.name} and {beside.name} written")
+
+
+class GIMP3D_OT_paint_reference(RunsReference, bpy.types.Operator):
+    """Put the reference view into the image '3D-GIMP reference', to be painted in the Image Editor; Remove uses it"""
+
+    bl_idname = "gimp3d.paint_reference"
+    bl_label = "Paint in Blender"
+    bl_options = {"UNDO"}
+
+    def deliver(self, context: bpy.types.Context, picture: Path, mask: Path) -> None:
+        backdrops.load_picture(mask, "mask")
+        image = backdrops.load_picture(picture, "reference")
+        context.scene.gimp3d.reference_paint = image
+        backdrops.show_in_image_editor(context, image)
 
 
 class GIMP3D_OT_load_reference(ReportsErrors, bpy.types.Operator, ImportHelper):
@@ -187,14 +259,16 @@ class GIMP3D_OT_load_reference(ReportsErrors, bpy.types.Operator, ImportHelper):
         path = Path(bpy.path.abspath(self.filepath))
         if not path.is_file():
             raise BadInput(f"the picture {path} does not exist")
-        context.scene.gimp3d.reference = _camera(context)
-        context.scene.gimp3d.reference_image = str(path)
+        settings = context.scene.gimp3d
+        settings.reference, settings.reference_image, settings.reference_paint = _camera(context), str(path), None
 
 
 CLASSES = (
     GIMP3D_OT_render_view,
     GIMP3D_OT_preview_masks,
+    GIMP3D_OT_hide_previews,
     GIMP3D_OT_choose_reference,
     GIMP3D_OT_export_reference,
+    GIMP3D_OT_paint_reference,
     GIMP3D_OT_load_reference,
 )

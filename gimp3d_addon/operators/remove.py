@@ -1,25 +1,61 @@
-"""Remove and restore."""
+"""Remove, go on with a stopped run, compare, restore."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import bpy
+from mathutils import Matrix
 
-from gimp3d.errors import BadInput
+from gimp3d.errors import BadInput, Gimp3dError
+from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
 
-from .. import jobs, splats
+from .. import jobs, splats, steps
 from ..bridge import present
-from ..worker import Worker
-from .base import FAILURES, current_boxes, current_splat, link, one_line, python_of
+from ..worker import Killed, Worker, duration
+from .base import RunsChild, current_boxes, current_splat, link, python_of
 
 SOURCE = "gimp3d_source"  # custom property of a result: the hidden object it came from
-TICK = 0.1  # s between two looks at the child's progress
 
 
-class GIMP3D_OT_remove_object(bpy.types.Operator):
+class RunsRemoval(RunsChild):
+    """Mixin: a removal in its job folder, and its result brought into the scene."""
+
+    folder: Path
+
+    def run(self, context: bpy.types.Context, *more: str) -> Worker:
+        context.scene.gimp3d.last_job = str(self.folder)
+        forecast = steps.forecast(context)
+        self._told = forecast.seconds if forecast and not more else 0.0
+        arguments = ["remove", "--job", str(self.folder), *more, "--progress", "json"]
+        return Worker(arguments, python_of(context), Clock(forecast) if forecast else None)
+
+    def collect(self, context: bpy.types.Context) -> None:
+        try:
+            summary = self.worker.result()
+        except Killed:
+            raise  # the job stays open: Resume goes on with it
+        except Gimp3dError:
+            jobs.close(self.folder)
+            raise
+        result = bring_back(context, self.folder)
+        jobs.close(self.folder)
+        settings, seconds, counts = context.scene.gimp3d, summary["seconds_total"], summary["counts"]
+        if self._told and counts["added"] and not self.worker.compiled:
+            settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever
+        report = self.folder / "report" / "index.html"
+        settings.last_report = str(report) if report.exists() else ""
+        for warning in summary["warnings"]:
+            self.report({"WARNING"}, warning)
+        settings.hole = f"{counts['hole_pixels']:,} pixels in {counts['views']} views"
+        self.report(
+            {"INFO"}, f"{result.name}: {counts['removed']:,} splats removed, {counts['added']:,} added "
+            f"in {duration(seconds)}",
+        )  # fmt: skip
+
+
+class GIMP3D_OT_remove_object(RunsRemoval, bpy.types.Operator):
     """Remove what lies in the box and fill the hole; the result is a new object and the original is hidden"""
 
     bl_idname = "gimp3d.remove_object"
@@ -36,96 +72,53 @@ class GIMP3D_OT_remove_object(bpy.types.Operator):
             return False
         return True
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Run to the end (scripts, background)."""
-        try:
-            self._start(context)
-            self._finish(context, self._worker.wait())
-        except FAILURES as error:
-            self.report({"ERROR"}, one_line(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Run beside Blender; Esc cancels."""
-        if bpy.app.background:
-            return self.execute(context)
-        try:
-            self._start(context)
-        except FAILURES as error:
-            self.report({"ERROR"}, one_line(error))
-            return {"CANCELLED"}
-        self._timer = context.window_manager.event_timer_add(TICK, window=context.window)
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
-
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if event.type == "ESC":
-            self._worker.cancel()
-            self._stop(context)
-            self.report({"INFO"}, "cancelled; the scene is as it was")
-            return {"CANCELLED"}
-        if event.type != "TIMER":
-            return {"PASS_THROUGH"}
-        ended = self._worker.poll()
-        settings = context.scene.gimp3d
-        settings.progress, settings.status = self._worker.progress, self._worker.status
-        context.workspace.status_text_set(f"3D-GIMP: {self._worker.status} (Esc cancels)")
-        for area in context.window.screen.areas:
-            area.tag_redraw()
-        if not ended:
-            return {"RUNNING_MODAL"}
-        self._stop(context)
-        try:
-            self._finish(context, self._worker.result())
-        except FAILURES as error:
-            self.report({"ERROR"}, one_line(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: another file is opened, or the window closes."""
-        self._worker.cancel()
-        self._stop(context)
-
-    def _start(self, context: bpy.types.Context) -> None:
+    def start(self, context: bpy.types.Context) -> Worker:
         splat = current_splat(context)
         if splat is None:
             raise BadInput("no splat object; import a PLY first (3D-GIMP panel, step 1)")
-        self._source = splat.name  # not the object: an undo meanwhile would make the reference invalid
-        self._folder = jobs.new_job_folder(splat.name)
-        jobs.write_job(context, self._folder)
-        arguments = ["remove", "--job", str(self._folder), "--progress", "json"]
-        self._worker = Worker(arguments, python_of(context))
-
-    def _stop(self, context: bpy.types.Context) -> None:
-        context.window_manager.event_timer_remove(self._timer)
-        context.workspace.status_text_set(None)
-        context.scene.gimp3d.progress, context.scene.gimp3d.status = 0.0, ""
-
-    def _finish(self, context: bpy.types.Context, summary: dict[str, Any]) -> None:
-        source, path = context.scene.objects.get(self._source), self._folder / "out.ply"
-        if source is None:
-            raise BadInput(f"{self._source} is no longer in the scene; the result lies in {path}")
-        result = bring_back(context, source, path)
-        report = self._folder / "report" / "index.html"
-        context.scene.gimp3d.last_report = str(report) if report.exists() else ""
-        for warning in summary.get("warnings", ()):
-            self.report({"WARNING"}, warning)
-        counts = summary.get("counts", {})
-        self.report(
-            {"INFO"},
-            f"{result.name}: {counts.get('removed', 0)} Gaussians removed, {counts.get('added', 0)} added "
-            f"in {summary.get('seconds_total', 0):.0f} s",
-        )
+        self.folder = jobs.new_job_folder(splat.name)
+        jobs.write_job(context, self.folder)
+        jobs.open_for(self.folder, splat)
+        return self.run(context)
 
 
-def bring_back(context: bpy.types.Context, source: bpy.types.Object, path: Path) -> bpy.types.Object:
-    """The finished PLY as a new object in the source's place; the source is hidden, not changed."""
-    result = splats.create_object(f"{source.name} removed", read_ply(path), source.matrix_world.copy())
-    result[SOURCE] = source
-    link(context, result, source.users_collection[0] if source.users_collection else None)
-    _hide(context, source, True)
+class GIMP3D_OT_resume(RunsRemoval, bpy.types.Operator):
+    """Go on with the removal that was cancelled or ended by a crash, from its last finished stage"""
+
+    bl_idname = "gimp3d.resume"
+    bl_label = "Resume"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("No removal was stopped half-way")
+        return RunsChild.running is None and jobs.unfinished(context) is not None
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        folder = jobs.unfinished(context)
+        if folder is None:
+            raise BadInput("no removal was stopped half-way")
+        self.folder = folder
+        return self.run(context, "--resume")
+
+
+def bring_back(context: bpy.types.Context, folder: Path) -> bpy.types.Object:
+    """The finished PLY as a new object in the source's place; the source is hidden, not changed.
+
+    Without the source (the file was never saved before a crash) the result comes alone.
+    """
+    name, matrix = jobs.source_of(folder)
+    source = context.scene.objects.get(name)
+    file = read_ply(folder / "out.ply")
+    title = name if source is not None and SOURCE in source else f"{name} removed"
+    if source is None:
+        result = splats.create_object(title, file, Matrix(matrix))
+        link(context, result)
+    else:
+        result = splats.create_like(source, title, file)
+        result[SOURCE] = source
+        link(context, result, source.users_collection[0] if source.users_collection else None)
+        _hide(context, source, True)
     context.scene.gimp3d.splat = result
     return result
 
@@ -134,6 +127,33 @@ def _hide(context: bpy.types.Context, obj: bpy.types.Object, hidden: bool) -> No
     obj.hide_render = hidden
     if obj.name in context.view_layer.objects:  # an excluded collection's objects cannot be hidden, and need not be
         obj.hide_set(hidden)
+
+
+def source_in(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The object that the current splat object was made from."""
+    splat = current_splat(context)
+    return present(context.scene, splat.get(SOURCE)) if splat is not None else None
+
+
+class GIMP3D_OT_compare(bpy.types.Operator):
+    """Switch between the scene before and after the removal"""
+
+    bl_idname = "gimp3d.compare"
+    bl_label = "Before / After"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Nothing was removed from this splat object")
+        return source_in(context) is not None
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        result, source = current_splat(context), source_in(context)
+        before = source.hide_render
+        context.scene.gimp3d.splat = result
+        _hide(context, source, not before)
+        _hide(context, result, before)
+        return {"FINISHED"}
 
 
 class GIMP3D_OT_restore(bpy.types.Operator):
@@ -146,19 +166,17 @@ class GIMP3D_OT_restore(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Nothing was removed from this splat object")
-        splat = current_splat(context)
-        return splat is not None and present(context.scene, splat.get(SOURCE)) is not None
+        return source_in(context) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        result = current_splat(context)
-        source = result[SOURCE]
+        result, source = current_splat(context), source_in(context)
         _hide(context, source, False)
         context.scene.gimp3d.splat = source
-        mesh = result.data
+        data = result.data
         bpy.data.objects.remove(result)
-        if mesh.users == 0:
-            bpy.data.meshes.remove(mesh)
+        if data.users == 0:
+            bpy.data.batch_remove([data])
         return {"FINISHED"}
 
 
-CLASSES = (GIMP3D_OT_remove_object, GIMP3D_OT_restore)
+CLASSES = (GIMP3D_OT_remove_object, GIMP3D_OT_resume, GIMP3D_OT_compare, GIMP3D_OT_restore)

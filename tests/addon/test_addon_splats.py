@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.images import read_image
 from gimp3d.io.ply import read_ply, write_gaussians
+from gimp3d_addon import splats
 
 XYZ = ["x", "y", "z"]
 NORMALS = ["nx", "ny", "nz"]
@@ -214,12 +216,9 @@ def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, impor
     render = blender_scene.render
     render.engine, render.resolution_x, render.resolution_y = "CYCLES", 32, 24
     blender_scene.cycles.samples, blender_scene.cycles.use_denoising = 4, False
-    modifier = splat.modifiers[0]
-    switch = next(s.identifier for s in modifier.node_group.interface.items_tree if s.name == "As Points")
     pictures = []
     for as_points in (False, True):
-        modifier[switch] = as_points
-        splat.update_tag()
+        splats.set_display(splat, "As Points", as_points)
         render.filepath = str(tmp_path / f"{as_points}.png")
         bpy.ops.render.render(write_still=True)
         pictures.append(read_image(render.filepath))
@@ -227,13 +226,19 @@ def test_points_in_the_viewport_render_as_splats(few_gaussians: Gaussians, impor
 
 
 @pytest.mark.slow
-def test_a_million_splats_are_read_in_seconds(few_gaussians: Gaussians, tmp_path: Path) -> None:
-    import time
-
+def test_a_million_splats_come_and_go_in_two_seconds_each(few_gaussians: Gaussians, tmp_path: Path) -> None:
+    """Processor time, the better of two: the first touches memory that the machine has yet to hand out."""
     write_gaussians(tmp_path / "big.ply", few_gaussians.take(np.arange(1_000_000) % 50))
-    start = time.perf_counter()
-    bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "big.ply"))
-    assert time.perf_counter() - start < 10
+    spent = {"import": [], "export": []}
+    for _ in range(2):
+        start = time.process_time()
+        bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "big.ply"))
+        spent["import"].append(time.process_time() - start)
+        start = time.process_time()
+        bpy.ops.gimp3d.export_ply(filepath=str(tmp_path / "out.ply"))
+        spent["export"].append(time.process_time() - start)
+    assert {k: min(v) < 2 for k, v in spent.items()} == {"import": True, "export": True}, spent
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "big.ply").read_bytes()
 
 
 @pytest.mark.parametrize(

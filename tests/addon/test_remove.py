@@ -18,7 +18,7 @@ from gimp3d.errors import Gimp3dError
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
-from gimp3d_addon import jobs, panels, splats
+from gimp3d_addon import jobs, splats
 from gimp3d_addon.worker import Worker
 
 
@@ -186,47 +186,3 @@ def test_a_killed_worker_says_so() -> None:
     worker = Worker(["info", "nowhere.ply"])
     with pytest.raises(Gimp3dError, match="cannot read"):
         worker.wait()
-
-
-class RecordingLayout:
-    """Stands in for UILayout in background: checks that every property and operator exists."""
-
-    def __init__(self, log: list[str]) -> None:
-        self.log = log
-
-    def prop(self, data, name: str, **_: object) -> None:
-        assert name in data.bl_rna.properties, name
-        self.log.append(name)
-
-    def operator(self, name: str, **_: object) -> RecordingLayout:
-        module, operator = name.split(".")
-        getattr(getattr(bpy.ops, module), operator).get_rna_type()
-        self.log.append(name)
-        return self
-
-    def label(self, text: str = "", **_: object) -> None:
-        self.log.append(text)
-
-    def progress(self, **_: object) -> None: ...
-
-    def box(self, **_: object) -> RecordingLayout:
-        return RecordingLayout(self.log)
-
-    row = box
-
-
-def test_the_panel_names_what_is_missing_and_offers_the_button(folder: Path) -> None:
-    log: list[str] = []
-
-    def draw() -> None:
-        log.clear()
-        for cls in (panels.GIMP3D_PT_main, panels.GIMP3D_PT_reference):
-            panel = type("Panel", (), dict(cls.__dict__))()
-            panel.layout = RecordingLayout(log)
-            panel.draw(bpy.context)
-
-    draw()
-    assert "No splat scene yet" in log and "gimp3d.import_ply" in log
-    prepare(folder)
-    draw()
-    assert f"{len(scene()):,} splats" in log and "9 views" in log and "gimp3d.remove_object" in log

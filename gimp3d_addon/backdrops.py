@@ -1,0 +1,64 @@
+"""Pictures over and behind a camera's view: previews, true renderings, photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from gimp3d.errors import BadInput
+
+OURS = "3D-GIMP "  # images whose names begin so are ours to replace
+
+
+def load_picture(path: Path, title: str) -> bpy.types.Image:
+    """A file as the packed image '3D-GIMP title', in place of the last one of that title."""
+    if not path.exists():
+        raise BadInput(f"{path.name} was not made")
+    image = bpy.data.images.get(OURS + title)
+    if image is None:
+        image = bpy.data.images.load(str(path))
+        image.name = OURS + title
+    else:
+        if image.packed_file:
+            image.unpack(method="REMOVE")
+        image.source, image.filepath = "FILE", str(path)
+        image.reload()
+    image.pack()
+    return image
+
+
+def put_over(camera: bpy.types.Object, image: bpy.types.Image) -> None:
+    """Show a picture in front of what the camera sees, in place of our last one."""
+    take_away(camera)
+    _place(camera, image, "FRONT")
+
+
+def put_behind(camera: bpy.types.Object, photo: Path) -> None:
+    """Show a photo behind what the camera sees."""
+    _place(camera, bpy.data.images.load(str(photo), check_existing=True), "BACK")
+
+
+def take_away(camera: bpy.types.Object) -> bool:
+    """Take our pictures off a camera; photos stay. Returns whether there was one."""
+    slots = camera.data.background_images
+    ours = [s for s in slots if s.display_depth == "FRONT" and (s.image is None or s.image.name.startswith(OURS))]
+    for slot in ours:
+        slots.remove(slot)
+    camera.data.update_tag()  # the view goes on drawing them otherwise
+    return bool(ours)
+
+
+def show_in_image_editor(context: bpy.types.Context, image: bpy.types.Image) -> None:
+    """In an Image Editor that is open; none is opened, as that would change the user's layout."""
+    for area in context.screen.areas if context.screen else ():
+        if area.type == "IMAGE_EDITOR":
+            area.spaces.active.image = image
+            return
+
+
+def _place(camera: bpy.types.Object, image: bpy.types.Image, depth: str) -> None:
+    slot = camera.data.background_images.new()
+    slot.image, slot.display_depth, slot.alpha = image, depth, 1.0
+    slot.frame_method = "STRETCH"  # the picture is the frame, also where the scene's resolution is another
+    camera.data.show_background_images = True

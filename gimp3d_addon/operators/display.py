@@ -1,0 +1,83 @@
+"""How splats look in Blender's own viewport and renders. Nothing here runs unless the user asks for it."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from gimp3d.errors import BadInput
+
+from .. import bridge, splats
+from ..native import is_native
+from .base import ReportsErrors, current_splat
+
+BOUNCES = 256  # transparent surfaces that a ray passes; with Blender's 8 crowded splats turn dark
+TRANSFORM = "Standard"  # splat colours are pictures' colours; AgX and Filmic would change them
+
+
+class GIMP3D_OT_update_colours(ReportsErrors, bpy.types.Operator):
+    """Colour the splats as they look from the active camera: shine and reflections depend on where one stands"""
+
+    bl_idname = "gimp3d.update_colours"
+    bl_label = "Colours from Camera"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Import a splat scene and make a camera active first")
+        splat = current_splat(context)
+        return splat is not None and not is_native(splat) and context.scene.camera is not None
+
+    def work(self, context: bpy.types.Context) -> None:
+        splat, camera = current_splat(context), context.scene.camera
+        if splat.mode == "EDIT":
+            raise BadInput("leave edit mode first")
+        context.view_layer.update()
+        place = np.array(camera.evaluated_get(context.evaluated_depsgraph_get()).matrix_world.translation)
+        splats.show_colours_from(splat, (np.linalg.inv(bridge.splat_frame(splat)) @ [*place, 1.0])[:3])
+
+
+def unfit_settings(scene: bpy.types.Scene) -> list[str]:
+    """What in the render settings makes splats look wrong."""
+    found = []
+    if scene.render.engine == "CYCLES" and scene.cycles.transparent_max_bounces < BOUNCES:
+        found.append(f"Transparent bounces {scene.cycles.transparent_max_bounces}: splats turn dark")
+    if scene.view_settings.view_transform != TRANSFORM:
+        found.append(f"View transform {scene.view_settings.view_transform}: colours are changed")
+    return found
+
+
+class GIMP3D_OT_prepare_render(ReportsErrors, bpy.types.Operator):
+    """Let renders show the splats' true colours: 256 transparent bounces in Cycles, view transform Standard"""
+
+    bl_idname = "gimp3d.prepare_render"
+    bl_label = "Set Up Render"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        scene = context.scene
+        scene.view_settings.view_transform = TRANSFORM
+        if scene.render.engine == "CYCLES":
+            scene.cycles.transparent_max_bounces = max(BOUNCES, scene.cycles.transparent_max_bounces)
+
+
+class GIMP3D_OT_even_scale(ReportsErrors, bpy.types.Operator):
+    """Give the splat object the same scale on all axes: splats cannot be stretched or mirrored"""
+
+    bl_idname = "gimp3d.even_scale"
+    bl_label = "Make Scale Even"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Step 1: import a splat scene")
+        return current_splat(context) is not None
+
+    def work(self, context: bpy.types.Context) -> None:
+        splat = current_splat(context)
+        splat.scale = (max(1e-6, sum(map(abs, splat.scale)) / 3),) * 3
+        context.view_layer.update()
+        bridge.splat_frame(splat)  # a parent may still stretch it
+
+
+CLASSES = (GIMP3D_OT_update_colours, GIMP3D_OT_prepare_render, GIMP3D_OT_even_scale)

@@ -1,0 +1,127 @@
+"""The Python that runs removals: made on request, and checked."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+from bpy.props import BoolProperty
+
+from gimp3d.errors import BadInput
+
+from ..properties import GIMP3D_preferences, preferences
+from ..worker import Worker, child_command, own_python
+from .base import RunsChild, python_of
+
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "zstandard")
+SIZES = ("about 170 MB to download, 650 MB on disk", "about 400 MB to download, 1.5 GB on disk")
+TORCH_INDEX = "https://download.pytorch.org/whl/cpu"  # PyPI's own brings 2 GB of CUDA along on Linux
+MAKE = """
+import json, subprocess, sys, venv
+folder, python, torch_index, *libraries = sys.argv[1:]
+say = lambda done, what: print(json.dumps({"stage": what, "done": done, "total": 3}), flush=True)
+say(0, "making the environment")
+venv.create(folder, with_pip=True, clear=True)
+pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+say(1, "installing the libraries")
+code = subprocess.run([*pip, *libraries]).returncode
+if torch_index and not code:
+    say(2, "installing PyTorch")
+    code = subprocess.run([*pip, "torch", "--index-url", torch_index]).returncode
+sys.exit(code)
+"""
+CHECK = """
+import importlib, json, sys
+sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
+found = {"python": sys.version.split()[0]}
+for name in ("numpy", "scipy", "numba", "cv2", "zstandard", "torch"):
+    try:
+        found[name] = importlib.import_module(name).__version__
+    except Exception as error:
+        found[name] = "" if isinstance(error, ModuleNotFoundError) else f"broken ({error})"
+print(json.dumps({"stage": "done", "summary": found}))
+"""
+NEEDED = ("numpy", "scipy", "numba", "cv2")
+USES = {"zstandard": "for newer .spz files", "torch": "refines the new splats"}
+
+
+def environment_folder() -> Path:
+    """Where the button puts the environment: the extension's user folder, which updates leave alone."""
+    package = GIMP3D_preferences.bl_idname
+    if package.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(package, path="environment", create=True))
+    return Path(bpy.utils.user_resource("DATAFILES", path="gimp3d/environment", create=True))
+
+
+def environment_python(folder: Path) -> Path:
+    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
+    """Make a Python environment with the libraries that Remove needs, and use it; asks before it downloads"""
+
+    bl_idname = "gimp3d.make_environment"
+    bl_label = "Make Environment"
+
+    torch: BoolProperty(
+        name="With PyTorch",
+        default=True,
+        description="Refines the new splats; without it the presets Balanced and Best leave them as Draft does",
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Enable the extension first")
+        return preferences(context) is not None and RunsChild.running is None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_props_dialog(self, width=420, confirm_text="Download and Install")
+
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.label(text=f"Downloads {', '.join(LIBRARIES)}")
+        self.layout.label(text=f"from PyPI: {SIZES[self.torch]}.")
+        self.layout.label(text=str(environment_folder()))
+        self.layout.prop(self, "torch")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """After the dialogue's OK: beside Blender in the window, waiting in scripts."""
+        return RunsChild.execute(self, context) if bpy.app.background else RunsChild.invoke(self, context, None)
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        if not bpy.app.online_access:
+            raise BadInput("Blender is set to stay offline; allow it in Preferences › System › Network")
+        folder = environment_folder()
+        self._python = environment_python(folder)
+        index = TORCH_INDEX if self.torch else ""
+        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), index, *LIBRARIES])
+
+    def collect(self, context: bpy.types.Context) -> None:
+        self.worker.result()
+        preferences(context).python = str(self._python)
+        self.report({"INFO"}, f"Remove now runs in {self._python}")
+
+
+class GIMP3D_OT_check(RunsChild, bpy.types.Operator):
+    """Say what the chosen Python has and what is missing"""
+
+    bl_idname = "gimp3d.check"
+    bl_label = "Check"
+
+    found: ClassVar[dict[str, str]] = {}  # of the last check, for the preferences
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        *head, _, core = child_command([], python_of(context))
+        return Worker([], command=[*head, CHECK, core])
+
+    def collect(self, context: bpy.types.Context) -> None:
+        GIMP3D_OT_check.found = dict(self.worker.result())
+        missing = [name for name in NEEDED if not self.found[name] or self.found[name].startswith("broken")]
+        if missing:
+            raise BadInput(f"the Python for Remove lacks {', '.join(missing)}; make an environment or choose another")
+        self.report({"INFO"}, "all is there: " + json.dumps(self.found))
+
+
+CLASSES = (GIMP3D_OT_make_environment, GIMP3D_OT_check)

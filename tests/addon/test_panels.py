@@ -1,0 +1,182 @@
+"""The panel at every stage of the work: it names what is missing and offers the button that mends it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import pytest
+from scenes import REGION, cameras, scene
+
+from gimp3d.gaussians import Gaussians
+from gimp3d.io.cameras import write_transforms
+from gimp3d_addon import panels, steps
+from gimp3d_addon.operators.base import RunsChild
+from gimp3d_addon.worker import Worker, duration
+
+
+class RecordingLayout:
+    """Stands in for UILayout in background: checks that every property, operator and option exists."""
+
+    def __init__(self, log: list[str]) -> None:
+        self.log = log
+
+    def prop(self, data, name: str, **_: object) -> None:
+        assert name in data.bl_rna.properties or data.path_resolve(name) is not None, name
+        self.log.append(name)
+
+    def operator(self, name: str, **_: object) -> Options:
+        module, operator = name.split(".")
+        self.log.append(name)
+        return Options(getattr(getattr(bpy.ops, module), operator).get_rna_type())
+
+    def label(self, text: str = "", icon: str = "NONE", **_: object) -> None:
+        assert icon in bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items
+        self.log.append(text)
+
+    def progress(self, factor: float = 0.0, text: str = "", **_: object) -> None:
+        assert 0 <= factor <= 1
+        self.log.append(text)
+
+    def row(self, **_: object) -> RecordingLayout:
+        return RecordingLayout(self.log)
+
+    column = row
+
+
+class Options:
+    """Stands in for the operator's properties that a button sets."""
+
+    def __init__(self, rna: bpy.types.Struct) -> None:
+        object.__setattr__(self, "rna", rna)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        prop = self.rna.properties[name]
+        assert prop.type != "ENUM" or value in prop.enum_items
+
+
+def drawn() -> list[str]:
+    """Every text, property and operator of the tab."""
+    log: list[str] = []
+    for cls in panels.CLASSES[1:]:  # the presets' menu is Blender's own
+        Drawable(cls, log).draw()
+    return log
+
+
+class Drawable:
+    """Calls a panel's functions on a stand-in: bpy's classes cannot be made from Python."""
+
+    def __init__(self, cls: type, log: list[str]) -> None:
+        self.cls, self.layout = cls, RecordingLayout(log)
+
+    def __getattr__(self, name: str) -> object:
+        found = inspect.getattr_static(self.cls, name)
+        return found.__get__(self, self.cls) if hasattr(found, "__get__") else found
+
+    def draw(self) -> None:
+        self.cls.draw(self, bpy.context)
+
+
+@pytest.fixture
+def splat(import_scene: Callable[[Gaussians], bpy.types.Object], tmp_path: Path) -> bpy.types.Object:
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
+    write_transforms(tmp_path / "transforms.json", cameras())
+    return import_scene(scene())
+
+
+def add_box() -> bpy.types.Object:
+    bpy.ops.gimp3d.add_roi()
+    box = bpy.context.object
+    box.location, box.scale = REGION[0].center, REGION[0].size
+    bpy.context.view_layer.update()
+    return box
+
+
+def test_every_step_names_what_is_missing_and_offers_the_button(splat: bpy.types.Object, tmp_path: Path) -> None:
+    bpy.data.objects.remove(splat)
+    log = drawn()
+    assert "No splat scene yet" in log and "gimp3d.import_ply" in log and "gimp3d.export_ply" not in log
+    assert "Step 1 first: No splat scene yet" in log
+    bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "scene.ply"))
+    log = drawn()
+    assert f"{len(scene()):,} splats · 3DGS, SH degree 0" in log and "No box round the object yet" in log
+    box = add_box()
+    log = drawn()
+    inside = sum(REGION[0].contains(scene().means))
+    assert any(line.startswith(f"{inside:,} splats inside") for line in log) and "No view yet" in log
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    log = drawn()
+    assert "9 views · drawn from the splats" in log
+    assert any(line.startswith("about ") and "GB" in line for line in log)
+    assert not [line for line in log if "first:" in line]
+    box.location.z = 50
+    bpy.context.view_layer.update()
+    assert "The box holds no splat; move it" in drawn()
+
+
+def test_the_count_follows_the_box(splat: bpy.types.Object) -> None:
+    box = add_box()
+    assert steps.splats_inside(splat, [box]) == sum(REGION[0].contains(scene().means))
+    box.location.x = 99
+    bpy.context.view_layer.update()
+    assert steps.splats_inside(splat, [box]) == 0
+    splat.location.x = 99 - REGION[0].center[0]
+    bpy.context.view_layer.update()
+    assert steps.splats_inside(splat, [box]) == sum(REGION[0].contains(scene().means))
+
+
+def test_an_uneven_scale_is_named_and_mended(splat: bpy.types.Object) -> None:
+    splat.scale = (1, 2, 1)
+    bpy.context.view_layer.update()
+    assert "scaled unevenly" in " ".join(drawn()) and "gimp3d.even_scale" in drawn()
+    bpy.ops.gimp3d.even_scale()
+    assert "gimp3d.even_scale" not in drawn()
+
+
+def test_a_view_that_cannot_be_used_is_named(splat: bpy.types.Object, tmp_path: Path) -> None:
+    add_box()
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    bpy.data.cameras["orbit/002"].type = "ORTHO"
+    assert "orbit/002 is ortho" in " ".join(drawn())
+
+
+def test_drawing_changes_nothing(splat: bpy.types.Object) -> None:
+    """Blender forbids it, and says so in the user's face: here the user has removed what shows the splats."""
+    bpy.data.node_groups.remove(bpy.data.node_groups[0])
+    before = len(bpy.data.node_groups), len(bpy.data.materials)
+    assert "gimp3d.update_colours" in drawn()
+    assert (len(bpy.data.node_groups), len(bpy.data.materials)) == before
+
+
+def test_while_it_runs_there_is_a_bar_and_a_cancel_button(splat: bpy.types.Object) -> None:
+    class Running(RunsChild):
+        bl_label = "Remove Object"
+
+    running = Running()
+    running.worker = Worker(["--version"])
+    running.worker.join()
+    RunsChild.running = running
+    try:
+        log = drawn()
+    finally:
+        RunsChild.running = None
+    assert "Remove Object" in log and "gimp3d.cancel" in log and "gimp3d.remove_object" not in log
+
+
+def test_every_property_and_operator_explains_itself(splat: bpy.types.Object) -> None:
+    operators = dir(bpy.ops.gimp3d)
+    assert len(operators) > 20
+    for name in operators:
+        rna = getattr(bpy.ops.gimp3d, name).get_rna_type()
+        assert len(rna.description) > 10, name
+        own = [p for p in rna.properties if p.identifier in ("fit", "size", "count", "fov", "step", "camera", "up")]
+        assert all(p.description for p in own), name
+    for prop in bpy.context.scene.gimp3d.bl_rna.properties:
+        assert prop.name and (prop.description or prop.identifier in ("name", "rna_type")), prop.identifier
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s"), (75, "75 s"), (200, "3 min"), (7200, "2.0 h")])
+def test_times_are_said_in_the_right_size(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
