@@ -114,7 +114,7 @@ def test_gaps_that_were_no_target_are_drawn_from_the_filled_scene() -> None:
         view(),
         silhouette=gap | view().silhouette,
         target=view().target & ~gap,
-        alpha_after=np.where(gap, np.float32(0.5), np.float32(1.0)),
+        alpha_after=np.where(gap | view().target, np.float32(0.5), np.float32(1.0)),
     )
     filled = floor(with_hole=False)
     done = _redrawn({camera.id: grey}, filled, [one], [view()])[camera.id]
