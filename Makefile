@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large bench-references extension screenshots clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -56,6 +56,10 @@ bench-depth: $(READY)
 
 bench-propagate: $(READY)
 	$(BIN)/python scripts/bench_propagate.py $(DATA)
+
+# 128 removals: an hour, so not part of bench
+bench-references: $(READY)
+	$(BIN)/python scripts/bench_references.py $(DATA)
 
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)

@@ -170,13 +170,15 @@ def agreement(rows: Sequence[dict[str, Any]]) -> list[str]:
         "## Agreement between views\n",
         "Painted views warped to one another by the true depth, PSNR in the painted pixels; coverage: their share of "
         "`mask` that the other view shows. True views differ as well, by view dependence and resampling: `beyond` "
-        "counts only what differs otherwise than in the truth.\n",
+        "counts only what differs otherwise than in the truth. Sharpness: size of the Laplacian in the compared pixels "
+        "over the truth's; blurred views agree easily.\n",
         table(
             [
                 "step",
                 *(f"{b} baselines ({angles[b]:.0f}°), dB" for b in angles),
                 *(f"beyond, {b}" for b in angles),
                 *(f"coverage, {b}" for b in angles),
+                *(f"sharpness, {b}" for b in angles),
             ],
             [
                 [
@@ -184,6 +186,7 @@ def agreement(rows: Sequence[dict[str, Any]]) -> list[str]:
                     *(f"{mean(m, b, 'psnr'):.2f}" for b in angles),
                     *("–" if m == "truth" else f"{mean(m, b, 'psnr_beyond'):.2f}" for b in angles),
                     *(f"{mean(m, b, 'coverage'):.0%}" for b in angles),
+                    *(f"{mean(m, b, 'sharpness'):.2f}" for b in angles),
                 ]
                 for m in methods
             ],

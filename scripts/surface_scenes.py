@@ -75,7 +75,7 @@ def read_scene(folder: Path) -> Scene:
         If something is missing.
     """
     if not (folder / "truth").is_dir():
-        raise BadInput(f"bench_surface: {folder} has no truth/; give the folder of scenes with and without the object")
+        raise BadInput(f"{folder} has no truth/; give the folder of scenes with and without the object")
     cameras = read_cameras(folder / "transforms.json")
     train = select_cameras(cameras, "train")
     photos = {c.id: load_view(c)[0] for c in train}
