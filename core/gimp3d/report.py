@@ -35,7 +35,7 @@ h1{font-size:1.6rem;margin:0}h2{font-size:1.15rem;margin:2rem 0 .6rem}
 table{border-collapse:collapse;width:100%}td,th{text-align:left;padding:.3rem .6rem;border-bottom:1px solid var(--edge)}
 td.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(330px,1fr));gap:1rem}
-figure{margin:0}figure img{width:100%;border-radius:6px;display:block}
+figure{margin:0}.wide{grid-column:1/-1}figure img{width:100%;border-radius:6px;display:block}
 figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}
 .flip:hover img+img{opacity:1}
@@ -68,7 +68,7 @@ def write_removal_report(
     for k, picture in enumerate(result.pictures):
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
-        stage_pictures.append((picture.title, name))
+        stage_pictures.append((picture.title, name, picture.kind == "rules"))
     page = _page(summary, pairs, flips, stage_pictures, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
@@ -175,7 +175,7 @@ def _page(
     summary: dict[str, Any],
     pairs: Sequence[tuple[str, str, str]],
     flips: Sequence[tuple[str, str]],
-    pictures: Sequence[tuple[str, str]],
+    pictures: Sequence[tuple[str, str, bool]],  # title, file, whether it takes a row of its own
     choices: Sequence[ReferenceChoice],
 ) -> str:
     counts, text = summary["counts"], html.escape
@@ -192,7 +192,9 @@ def _page(
         for name, a, b in pairs
     )
     stages = "".join(
-        f"<figure><img src='{name}' alt=''><figcaption>{text(title)}</figcaption></figure>" for title, name in pictures
+        f"<figure{' class=wide' if wide else ''}><img src='{name}' alt=''>"
+        f"<figcaption>{text(title)}</figcaption></figure>"
+        for title, name, wide in pictures
     )
     legend = "".join(
         f"<span class=dot style='background:rgb{colour}'></span>{text(words)}"
