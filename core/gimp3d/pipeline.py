@@ -116,9 +116,8 @@ class Picture:
     kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    data: tuple[
-        np.ndarray, ...
-    ]  # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
+    data: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
