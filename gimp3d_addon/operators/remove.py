@@ -135,17 +135,21 @@ def source_in(context: bpy.types.Context) -> bpy.types.Object | None:
     return present(context.scene, splat.get(SOURCE)) if splat is not None else None
 
 
-class GIMP3D_OT_compare(bpy.types.Operator):
-    """Switch between the scene before and after the removal"""
-
-    bl_idname = "gimp3d.compare"
-    bl_label = "Before / After"
-    bl_options = {"REGISTER", "UNDO"}
+class OnResult:
+    """Mixin: for the object that a removal made."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Nothing was removed from this splat object")
         return source_in(context) is not None
+
+
+class GIMP3D_OT_compare(OnResult, bpy.types.Operator):
+    """Switch between the scene before and after the removal"""
+
+    bl_idname = "gimp3d.compare"
+    bl_label = "Before / After"
+    bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         result, source = current_splat(context), source_in(context)
@@ -156,17 +160,12 @@ class GIMP3D_OT_compare(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class GIMP3D_OT_restore(bpy.types.Operator):
+class GIMP3D_OT_restore(OnResult, bpy.types.Operator):
     """Show the original scene again and take the result away"""
 
     bl_idname = "gimp3d.restore"
     bl_label = "Restore"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Nothing was removed from this splat object")
-        return source_in(context) is not None
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         result, source = current_splat(context), source_in(context)

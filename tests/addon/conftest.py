@@ -24,7 +24,10 @@ except ModuleNotFoundError:  # a skip from here would end the whole run
 else:
     import gimp3d_addon
 
+from scenes import REGION, cameras, scene
+
 from gimp3d.gaussians import Gaussians
+from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
 
 
@@ -67,3 +70,15 @@ def import_scene(tmp_path: Path) -> Callable[[Gaussians], bpy.types.Object]:
         return bpy.context.object
 
     return load
+
+
+@pytest.fixture
+def splat(import_scene: Callable[[Gaussians], bpy.types.Object], tmp_path: Path) -> bpy.types.Object:
+    """The block scene in a saved file, with its box and its cameras: ready to press Remove."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
+    obj = import_scene(scene())
+    bpy.ops.gimp3d.add_roi()
+    bpy.context.object.location, bpy.context.object.scale = REGION[0].center, REGION[0].size
+    write_transforms(tmp_path / "transforms.json", cameras())
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    return obj

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
-from scenes import REGION, cameras, scene
+from scenes import cameras, scene
 
-from gimp3d.gaussians import Gaussians
-from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply
 from gimp3d.pipeline import render_bytes
@@ -22,15 +19,10 @@ GREEN = (20, 200, 40)
 
 
 @pytest.fixture
-def splat(import_scene: Callable[[Gaussians], bpy.types.Object], tmp_path: Path) -> bpy.types.Object:
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
-    obj = import_scene(scene())
-    bpy.ops.gimp3d.add_roi()
-    bpy.context.object.location, bpy.context.object.scale = REGION[0].center, REGION[0].size
-    write_transforms(tmp_path / "transforms.json", cameras())
-    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+def splat(splat: bpy.types.Object) -> bpy.types.Object:
+    """The block scene, looked at through a camera."""
     bpy.ops.gimp3d.look_through(camera="orbit/002")
-    return obj
+    return splat
 
 
 def share_of_green(folder: Path, mask: np.ndarray) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
-from scenes import REGION, cameras, scene
+from scenes import cameras
 
 from gimp3d.cli import main
 from gimp3d.errors import Gimp3dError
@@ -27,18 +26,6 @@ from gimp3d_addon.operators.remove import SOURCE
 from gimp3d_addon.worker import Worker
 
 SIZE = (120, 90)
-
-
-@pytest.fixture
-def splat(import_scene: Callable[[Gaussians], bpy.types.Object], tmp_path: Path) -> bpy.types.Object:
-    """The block scene in a saved file, with its box and its cameras."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
-    obj = import_scene(scene())
-    bpy.ops.gimp3d.add_roi()
-    bpy.context.object.location, bpy.context.object.scale = REGION[0].center, REGION[0].size
-    write_transforms(tmp_path / "transforms.json", cameras())
-    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
-    return obj
 
 
 def select(obj: bpy.types.Object) -> None:

@@ -12,28 +12,13 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from scenes import REGION, cameras, scene
 
-from gimp3d.gaussians import Gaussians
-from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply
 from gimp3d_addon import jobs, splats
 from gimp3d_addon.operators.base import RunsChild, current_splat
 from gimp3d_addon.operators.reference import RunsReference
 from gimp3d_addon.operators.remove import SOURCE, GIMP3D_OT_remove_object, RunsRemoval
 from gimp3d_addon.worker import Worker
-
-
-@pytest.fixture
-def splat(import_scene: Callable[[Gaussians], bpy.types.Object], tmp_path: Path) -> bpy.types.Object:
-    """The block scene in a saved file, ready to press Remove."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
-    obj = import_scene(scene())
-    bpy.ops.gimp3d.add_roi()
-    bpy.context.object.location, bpy.context.object.scale = REGION[0].center, REGION[0].size
-    write_transforms(tmp_path / "transforms.json", cameras())
-    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
-    return obj
 
 
 class Window:
