@@ -58,16 +58,21 @@ class NoisyDepths:
         self.backend, self.relative, self.seed = backend, relative, seed
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering:
-        drawn = self.backend.render(gaussians, camera, settings, passes)
+        drawn = self.backend.render(gaussians, camera, settings, passes, pixels)
         depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
         return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
 
     def surface_depth(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        depth, alpha = self.backend.surface_depth(gaussians, camera, settings)
+        depth, alpha = self.backend.surface_depth(gaussians, camera, settings, pixels)
         return depth * self._factor(camera), alpha
 
     def _factor(self, camera: Camera) -> np.ndarray:

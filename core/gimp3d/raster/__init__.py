@@ -50,6 +50,7 @@ def render(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> Rendering:
     """Draw a scene (paper eq. 1 and 2).
 
@@ -61,9 +62,9 @@ def render(
     Raises
     ------
     ValueError
-        If a pass is unknown.
+        If a pass is unknown, or the mask has not the picture's shape.
     """
-    return current_backend().render(gaussians, camera, settings, passes)
+    return current_backend().render(gaussians, camera, settings, passes, pixels)
 
 
 def trace(
@@ -113,22 +114,24 @@ def footprint(
     camera: Camera,
     chosen: np.ndarray,  # [N] bool
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> np.ndarray:
     """Accumulated blend weight of the chosen Gaussians, [H, W] float32; others may hide them."""
-    return current_backend().footprint(gaussians, camera, chosen, settings)
+    return current_backend().footprint(gaussians, camera, chosen, settings, pixels)
 
 
 def surface_depth(
     gaussians: Gaussians,
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha; both [H, W] float32.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
     splats (Yu 2024; Zhang 2024). 0 where alpha < 0.5.
     """
-    return current_backend().surface_depth(gaussians, camera, settings)
+    return current_backend().surface_depth(gaussians, camera, settings, pixels)
 
 
 def contributions(

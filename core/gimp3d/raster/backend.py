@@ -36,7 +36,12 @@ class Backend(Protocol):
     """What a backend must do; the functions of this package say what each means. Arrays are NumPy's, in and out."""
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering: ...
 
     def trace(
@@ -53,11 +58,16 @@ class Backend(Protocol):
     ) -> PixelRegion: ...
 
     def footprint(
-        self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        chosen: np.ndarray,
+        settings: RasterSettings,
+        pixels: np.ndarray | None,
     ) -> np.ndarray: ...
 
     def surface_depth(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]: ...
 
     def contributions(

@@ -14,7 +14,7 @@ from ..gaussians import Gaussians
 from ..jit import announce_compilation
 from ..threads import parallel_map, run_ranges, thread_count
 from .bin import TileLists, tile_lists
-from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
 from .project import (
     BLUE,
     DEPTH,
@@ -172,6 +172,20 @@ def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
 
 
+def wanted_tiles(camera: Camera, pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
+    if pixels is None:
+        return whole_picture(camera)
+    if pixels.shape != (camera.height, camera.width):
+        raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
+    across, down = tile_grid(camera)
+    blocks = np.empty(across * down, np.uint64)
+    region_blocks(np.require(pixels, bool, ["C", "W"]), across, blocks)
+    slots = np.full(across * down, -1, np.int32)
+    slots[blocks > 0] = np.arange(np.count_nonzero(blocks))
+    return slots.reshape(down, across), blocks[blocks > 0]
+
+
 @dataclass(frozen=True)
 class Trace:
     """What the way back needs of a rendering."""
@@ -204,22 +218,33 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
-def render(gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]) -> Rendering:
-    return _draw(gaussians, camera, settings, passes, keep=False)[0]
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    pixels: np.ndarray | None,
+) -> Rendering:
+    return _draw(gaussians, camera, settings, passes, False, pixels)[0]
 
 
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    return _draw(gaussians, camera, settings, passes, keep=True)
+    return _draw(gaussians, camera, settings, passes, True, None)
 
 
 def _draw(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], keep: bool
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    keep: bool,
+    pixels: np.ndarray | None,
 ) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
+    slots, wanted = wanted_tiles(camera, pixels)
     view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
-    slots, wanted = whole_picture(camera)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = depth_shifts(lists, view.features)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
@@ -374,12 +399,14 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     )
 
 
-def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings) -> np.ndarray:
+def footprint(
+    gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings, pixels: np.ndarray | None
+) -> np.ndarray:
     if chosen.shape != (len(gaussians),):
         raise ValueError(f"chosen: expected shape {(len(gaussians),)}, got {chosen.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
     view.features[:, RED : BLUE + 1] = chosen[:, None]  # painted white on black
-    slots, wanted = whole_picture(camera)
+    slots, wanted = wanted_tiles(camera, pixels)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
     black = replace(settings, background=(0.0, 0.0, 0.0))
     flags, shifts = pass_flags(frozenset({"rgb"})), np.ones(len(wanted), np.float32)
@@ -395,7 +422,7 @@ def contributions(
     if counted.shape != shape:
         raise ValueError(f"pixels: expected shape {shape}, got {counted.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
-    lists = tile_lists(view.features, view.rects, view.states, whole_picture(camera)[0], with_records=False)
+    lists = tile_lists(view.features, view.rects, view.states, wanted_tiles(camera, pixels)[0], with_records=False)
     sums, peaks = np.zeros((2, len(lists.entries)), np.float32)
     limits = pack_limits(settings)
     over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)

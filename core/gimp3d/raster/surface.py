@@ -26,9 +26,11 @@ REACH = 3.0  # standard deviations from its centre, along z, within which a Gaus
 MEDIAN_ONLY = np.array([False, False, True, False, False])  # blend_range's flags
 
 
-def surface_depth(gaussians: Gaussians, camera: Camera, settings: RasterSettings) -> tuple[np.ndarray, np.ndarray]:
+def surface_depth(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     view = cpu.project(gaussians, camera, settings, with_colour=False)
-    slots, wanted = cpu.whole_picture(camera)
+    slots, wanted = cpu.wanted_tiles(camera, pixels)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
     if not gaussians.is_surfels:  # their numbers, from 1 on, are drawn in place of the depths
         view.features.view(np.int32)[:, DEPTH] = np.arange(1, len(gaussians) + 1)

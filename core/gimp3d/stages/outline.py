@@ -117,6 +117,13 @@ def gaussians_window(gaussians: Gaussians, camera: Camera, margin: int) -> Windo
     return window_round(ends * [camera.fx, camera.fy] + [camera.cx, camera.cy], camera, margin)
 
 
+def window_mask(window: Window, camera: Camera) -> np.ndarray:
+    """[H, W] bool: the pixels of a view that lie in a window."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[window] = True
+    return mask
+
+
 def cropped(camera: Camera, window: Window) -> Camera:
     """The part of a view in a window, with exact intrinsics."""
     rows, cols = window

@@ -159,7 +159,12 @@ class FakeBackend:
     traces: list[FakeTrace] = field(default_factory=list)
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None = None,
     ) -> Rendering:
         self.seen.append(gaussians)
         size = (camera.height, camera.width)
@@ -173,7 +178,12 @@ class FakeBackend:
         return self.render(gaussians, camera, settings, passes), self.traces[-1]
 
     def footprint(
-        self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        chosen: np.ndarray,
+        settings: RasterSettings,
+        pixels: np.ndarray | None,
     ) -> np.ndarray:
         return np.full((camera.height, camera.width), 8, np.float32)
 
