@@ -264,9 +264,9 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
-        touched = {v.camera.id: window_mask(gaussians_window(new, v.camera, 0), v.camera) for v in masks.views}
-        painted = _redrawn(painted, filled, masks.views, touched)
-        open_views = _all_still_open(open_views, filled, len(added), rules, touched, settings.masks)
+        near_new = {v.camera.id: window_mask(gaussians_window(new, v.camera, 0), v.camera) for v in masks.views}
+        painted = _redrawn(painted, filled, masks.views, near_new)
+        open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:

@@ -281,9 +281,7 @@ def _sunk(
     return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
 
 
-def _colour_step(
-    scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]
-) -> tuple[np.ndarray, np.ndarray]:
+def _colour_step(scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]) -> tuple[np.ndarray, np.ndarray]:
     """W's column sums, and Wᵀ (painted − drawn) in units of c_0, [N, 3] each, where the view's own pixels painted."""
     camera, paint = look
     wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
