@@ -21,7 +21,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, footprint, render, surface_depth
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
-from .stages.exposure import level_exposure
+from .stages.exposure import Exposure, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -46,7 +46,14 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.refine import Refinement, RefineSettings, observed, refine_gaussians, torch_is_there
+from .stages.refine import (
+    Refinement,
+    RefineSettings,
+    load_torch_ahead,
+    observed,
+    refine_gaussians,
+    torch_is_there,
+)
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
@@ -209,6 +216,8 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
+    if settings.refine.steps:
+        load_torch_ahead()
     photos = {v.camera.id: v.image for v in views}
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
@@ -226,13 +235,18 @@ def remove_object(
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
-    drawn = {v.camera.id: render_bytes(kept, v.camera) for v in masks.views}
-    exposures = {v.camera.id: level_exposure(v, photos[v.camera.id], drawn[v.camera.id]) for v in masks.views}
+
+    def emptied(view: ViewMasks) -> tuple[Exposure, np.ndarray]:
+        """The photo at the splats' exposure, and as it is without the object, as far as that is known."""
+        drawn = render_bytes(kept, view.camera)
+        exposure = level_exposure(view, photos[view.camera.id], drawn)
+        return exposure, np.where(view.silhouette[..., None], drawn, exposure.image)
+
+    names = [v.camera.id for v in masks.views]
+    emptied_views = parallel_map(emptied, masks.views)
+    exposures = dict(zip(names, (e for e, _ in emptied_views)))
     levelled = {name: e.image for name, e in exposures.items()}
-    painted = {
-        v.camera.id: np.where(v.silhouette[..., None], drawn[v.camera.id], levelled[v.camera.id]) for v in masks.views
-    }
-    del drawn
+    painted = dict(zip(names, (picture for _, picture in emptied_views)))
     filled, added = kept, None
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
@@ -264,7 +278,7 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
-        near_new = {v.camera.id: window_mask(gaussians_window(new, v.camera, 0), v.camera) for v in masks.views}
+        near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
@@ -272,10 +286,12 @@ def remove_object(
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
-    painted = {
-        name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
-        for name, v in ((v.camera.id, v) for v in masks.views)
-    }
+
+    def finished(view: ViewMasks) -> np.ndarray:
+        name = view.camera.id
+        return exposures[name].back(painted[name], photos[name], view.silhouette | view.target)
+
+    painted = dict(zip(names, parallel_map(finished, masks.views)))
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
@@ -484,6 +500,12 @@ def _appearance(
     filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
+
+
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
+    """ID → [H, W] bool: where a view may show the Gaussians."""
+    cameras = [v.camera for v in views]
+    return {c.id: window_mask(gaussians_window(gaussians, c, 0), c) for c in cameras}
 
 
 def _redrawn(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,7 @@ from .propagate import Rule
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
 C1, C2 = 0.01**2, 0.03**2
+BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,11 @@ def torch_is_there() -> bool:
     return True
 
 
+def load_torch_ahead() -> None:
+    """Import torch, if it is there, beside other work: it takes a second."""
+    threading.Thread(target=torch_is_there, name="import torch").start()
+
+
 def refine_gaussians(
     frozen: Gaussians,  # the rest of the scene: its arrays are only read
     new: Gaussians,
@@ -156,7 +163,6 @@ def _refine(
     for step in range(1, settings.steps + 1):
         if not order:
             order = list(rng.permutation(len(learners)))
-        state.optimiser.zero_grad()
         learners[order.pop()].loss(state).backward()
         state.step()
         if step % settings.check == 0 or step == settings.steps:
@@ -192,16 +198,28 @@ class _State:
             settings.rate_view_dependence,
         )
         self.parameters = [torch.tensor(a, dtype=torch.float32, requires_grad=True) for a in arrays]
-        groups = [{"params": [p], "lr": r} for p, r in zip(self.parameters, rates) if p.numel()]
-        self.optimiser = torch.optim.Adam(groups, eps=1e-15)
+        self.rates, self.steps = rates, 0
+        self.moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self.parameters]
 
     def step(self) -> None:
+        """A step of Adam (Kingma 2015) along the gradients, which are used up.
+
+        As torch.optim.Adam to the last bit, but making one of those loads half of torch, which takes a second.
+        """
         import torch
 
-        for p in self.parameters:
-            if p.grad is not None:
-                torch.nan_to_num_(p.grad, 0.0, 0.0, 0.0)
-        self.optimiser.step()
+        self.steps += 1
+        beta, beta2 = BETAS
+        with torch.no_grad():
+            for p, rate, (mean, square) in zip(self.parameters, self.rates, self.moments):
+                if p.grad is None or not p.numel():
+                    continue
+                slope = torch.nan_to_num_(p.grad, 0.0, 0.0, 0.0)
+                mean.lerp_(slope, 1 - beta)
+                square.mul_(beta2).addcmul_(slope, slope, value=1 - beta2)
+                size = (square.sqrt() / math.sqrt(1 - beta2**self.steps)).add_(EPSILON)
+                p.addcdiv_(mean, size, value=-rate / (1 - beta**self.steps))
+                p.grad = None
 
     def gaussians(self) -> Gaussians:
         means, log_scales, quats, opacity_logits, dc, rest = (p.detach().numpy() for p in self.parameters)

@@ -105,6 +105,25 @@ def test_nothing_to_do_returns_the_input() -> None:
     assert refine_gaussians(known, none, [nothing], QUICK).gaussians is none
 
 
+def test_steps_are_those_of_torchs_own_adam() -> None:
+    seeds = replace(floor(with_hole=True).take(np.arange(20)), sh=np.zeros((20, 4, 3), np.float32))
+    state = refine._State(seeds, QUICK)
+    theirs = [p.detach().clone().requires_grad_() for p in state.parameters]
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(theirs, state.rates)]
+    optimiser = torch.optim.Adam(groups, eps=1e-15)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        for own, other in zip(state.parameters, theirs):
+            own.grad = torch.randn(own.shape, generator=generator)
+            other.grad = own.grad.clone()
+        state.parameters[0].grad[0, 0] = float("nan")  # such a slope is none
+        theirs[0].grad[0, 0] = 0.0
+        state.step()
+        optimiser.step()
+    for own, other in zip(state.parameters, theirs):
+        assert torch.equal(own, other)
+
+
 def test_pixels_count_as_far_as_their_rule_is_believed() -> None:
     camera = cameras(9)[1]
     rules = np.array([[*Rule]], np.uint8)
