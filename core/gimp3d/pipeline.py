@@ -49,10 +49,8 @@ from .stages.reference import (
 from .stages.refine import (
     Refinement,
     RefineSettings,
-    load_torch_ahead,
     observed,
     refine_gaussians,
-    torch_is_there,
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
@@ -216,8 +214,6 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress)
-    if settings.refine.steps:
-        load_torch_ahead()
     photos = {v.camera.id: v.image for v in views}
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
@@ -304,11 +300,8 @@ def _refined(
     told: dict[str, np.ndarray],
     settings: RemovalSettings,
 ) -> Gaussians | None:
-    """The new Gaussians, optimised where the settings ask for it and torch is there."""
+    """The new Gaussians, optimised where the settings ask for it."""
     if added is None or not settings.refine.steps:
-        return added
-    if not torch_is_there():
-        run.warnings.append("torch is not installed: the new Gaussians are not refined, as in the preset draft")
         return added
     views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
     refinement: Refinement = run(
