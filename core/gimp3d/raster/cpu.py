@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,19 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..jit import announce_compilation
 from ..threads import parallel_map, run_ranges, thread_count
-from .bin import TileLists, tile_lists
-from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .bin import TileLists, mark_touched, tile_lists
+from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
 from .project import (
-    BLUE,
     DEPTH,
+    DRAWN,
     ELLIPSE_ROW,
     HALF_LOG2E,
-    RED,
     SURFEL_ROW,
     TILE,
     UNUSABLE,
     project_range,
 )
-from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering
+from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
@@ -34,6 +33,7 @@ FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
 CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
+BLOCK_ROWS = np.array([0x0101010101010101 & ((1 << 8 * n) - 1) for n in range(9)], np.uint64)  # first column's blocks
 NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
 
 
@@ -51,16 +51,20 @@ class View:
 
 
 def project(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, out: View | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    with_colour: bool,
+    out: View | None = None,
+    tiles: tuple[int, int, int, int] | None = None,
 ) -> View:
-    """Feature rows of the Gaussians that reach the picture; into `out` where it is given."""
+    """Feature rows of the Gaussians that reach the picture, or some of its tiles; into `out` where it is given."""
     announce_compilation()
     n = len(gaussians)
     if out is None:
         features = empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
         out = View(features, empty((n, 4), np.int16), empty(n, np.int8))
     sh = raw(gaussians.sh)
-    across, down = tile_grid(camera)
     run_ranges(
         project_range,
         n,
@@ -71,8 +75,8 @@ def project(
         sh,
         sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
         pack_camera(camera),
-        across,
-        down,
+        *tile_grid(camera),
+        np.array(tiles or (0, 0, *tile_grid(camera)), np.int64),
         float(settings.near),
         float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
         float(settings.alpha_min),
@@ -109,7 +113,7 @@ def pack_camera(camera: Camera) -> np.ndarray:
 
 
 def pass_flags(passes: frozenset[str]) -> np.ndarray:
-    """blend_range's flags, [5] bool: rgb, expected depth, median depth, normals, distortion.
+    """blend_range's flags, [6] bool: rgb, expected depth, median depth, normals, distortion, numbers for depths.
 
     Raises
     ------
@@ -119,7 +123,8 @@ def pass_flags(passes: frozenset[str]) -> np.ndarray:
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
-    return np.array(["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes])
+    wanted = ["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes]
+    return np.array([*wanted, False])
 
 
 def pack_limits(settings: RasterSettings) -> np.ndarray:
@@ -150,26 +155,49 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
     return raw(np.pad(picture, missing) if missing[0][1] or missing[1][1] else picture).reshape(-1)
 
 
-def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
-    """The kernels' pictures without what pads them to whole blocks."""
+def as_rendering(
+    pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int, window: Window | None = None
+) -> Rendering:
+    """The kernels' pictures without what pads them to whole blocks, or a window of them."""
     height, width = padded_size(camera)
     cut = []
     for flat, channels in zip(pictures, CHANNELS):
         picture = flat.reshape(height if len(flat) else 0, width if len(flat) else 0, channels)
-        picture = picture[: camera.height, : camera.width]
+        picture = picture[window or whole(camera)]
         cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
     rgb, alpha, expected, median, normals, distortion = cut
     return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
 
 
-def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
-    across, down = tile_grid(camera)
-    columns = np.minimum(-(-(camera.width - TILE * np.arange(across)) // 4), 8).astype(np.uint64)
-    rows = np.minimum(-(-(camera.height - TILE * np.arange(down)) // 4), 8).astype(np.uint64)
-    first_column = np.uint64(0x0101010101010101) >> (np.uint64(64) - np.uint64(8) * rows)
-    wanted = ((np.uint64(1) << columns) - np.uint64(1))[None] * first_column[:, None]
-    return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
+def whole(camera: Camera) -> Window:
+    """All of a picture."""
+    return slice(0, int(camera.height)), slice(0, int(camera.width))
+
+
+def slots_of(
+    wanted: np.ndarray,  # [down, across] bool
+) -> np.ndarray:
+    """Slots [down, across] int32 of the wanted tiles in row-major order, −1 elsewhere."""
+    return np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1).astype(np.int32)
+
+
+def window_tiles(window: Window) -> tuple[int, int, int, int]:
+    """First column and row of the tiles that a window meets, and one past the last."""
+    rows, cols = window
+    return cols.start // TILE, rows.start // TILE, -(-cols.stop // TILE), -(-rows.stop // TILE)
+
+
+def window_blocks(camera: Camera, window: Window) -> np.ndarray:
+    """The blocks of every tile that a window meets, [down, across] uint64."""
+    ends = []
+    for part, tiles in zip(window, tile_grid(camera)[::-1]):
+        blocks = np.array([[part.start // BLOCK], [-(-part.stop // BLOCK)]]) - TILE // BLOCK * np.arange(tiles)
+        ends.append(np.clip(blocks, 0, TILE // BLOCK))
+    (top, bottom), (left, right) = ends
+    one = np.uint64(1)
+    return (BLOCK_ROWS[bottom] - BLOCK_ROWS[top])[:, None] * (
+        (one << right.astype(np.uint64)) - (one << left.astype(np.uint64))
+    )
 
 
 @dataclass(frozen=True)
@@ -219,7 +247,8 @@ def _draw(
 ) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
     view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
-    slots, wanted = whole_picture(camera)
+    blocks = window_blocks(camera, whole(camera))
+    wanted, slots = blocks.ravel(), slots_of(blocks > 0)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = depth_shifts(lists, view.features)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
@@ -374,31 +403,61 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     )
 
 
-def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings) -> np.ndarray:
-    if chosen.shape != (len(gaussians),):
-        raise ValueError(f"chosen: expected shape {(len(gaussians),)}, got {chosen.shape}")
-    view = project(gaussians, camera, settings, with_colour=False)
-    view.features[:, RED : BLUE + 1] = chosen[:, None]  # painted white on black
-    slots, wanted = whole_picture(camera)
-    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
-    black = replace(settings, background=(0.0, 0.0, 0.0))
-    flags, shifts = pass_flags(frozenset({"rgb"})), np.ones(len(wanted), np.float32)
-    pictures, _ = blend(gaussians, view, camera, black, flags, view.features, lists, wanted, shifts, keep=False)
-    return np.ascontiguousarray(as_rendering(pictures, camera, view.ignored).rgb[..., 0])
-
-
 def contributions(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
 ) -> Contributions:
+    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels
+    total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
+    return Contributions(total[0], peak)
+
+
+def label_weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    labels: np.ndarray,
+    count: int,
+    rows: np.ndarray | None,
+) -> np.ndarray:
+    return _weigh(gaussians, camera, settings, labels, count, rows)[0]
+
+
+def _weigh(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    labels: np.ndarray,  # [H, W] 0 … count
+    count: int,
+    rows: np.ndarray | None,  # [N] bool: whose weights are asked for
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
     shape = (camera.height, camera.width)
-    counted = np.ones(shape, bool) if pixels is None else np.require(pixels, bool, ["C", "W"])
-    if counted.shape != shape:
-        raise ValueError(f"pixels: expected shape {shape}, got {counted.shape}")
+    if labels.shape != shape:
+        raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
-    lists = tile_lists(view.features, view.rects, view.states, whole_picture(camera)[0], with_records=False)
-    sums, peaks = np.zeros((2, len(lists.entries)), np.float32)
+    across, down = tile_grid(camera)
+    counted = np.require(labels, np.uint8, ["C", "W"])
+    blocks = np.empty(down * across, np.uint64)
+    region_blocks(counted, across, blocks)
+    wanted = (blocks > 0).reshape(down, across)
+    if rows is not None:
+        touched = np.zeros((down, across), bool)
+        mark_touched(view.rects, view.states, rows, touched)
+        wanted &= touched
+    lists = tile_lists(view.features, view.rects, view.states, slots_of(wanted), with_records=False)
+    sums, peaks = np.zeros((count, len(lists.entries)), np.float32), np.zeros(len(lists.entries), np.float32)
     limits = pack_limits(settings)
     over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)
-    total, peak = np.zeros((2, len(gaussians)), np.float32)
+    total, peak = np.zeros((count, len(gaussians)), np.float32), np.zeros(len(gaussians), np.float32)
     gather_weights(lists.entries, sums, peaks, total, peak)
-    return Contributions(total, peak)
+    return total, peak
+
+
+def touched_window(gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window:
+    view = project(gaussians, camera, settings, with_colour=False)
+    rects = view.rects[view.states == DRAWN]
+    if not len(rects):
+        return slice(0, 1), slice(0, 1)
+    left, top = TILE * rects[:, :2].min(0).astype(int) - margin
+    right, bottom = TILE * rects[:, 2:].max(0).astype(int) + margin
+    return slice(max(0, top), min(camera.height, bottom)), slice(max(0, left), min(camera.width, right))

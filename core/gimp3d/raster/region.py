@@ -46,10 +46,8 @@ class CpuPixelRegion:
         self._flags = cpu.pass_flags(passes)
         across, down = cpu.tile_grid(camera)
         blocks = np.empty(across * down, np.uint64)
-        region_blocks(np.require(pixels, bool, ["C", "W"]), across, blocks)
-        self._slots = np.full(across * down, -1, np.int32)
-        self._slots[blocks > 0] = np.arange(np.count_nonzero(blocks))
-        self._slots = self._slots.reshape(down, across)
+        region_blocks(np.require(pixels, bool, ["C", "W"]).view(np.uint8), across, blocks)
+        self._slots = cpu.slots_of((blocks > 0).reshape(down, across))
         self._wanted = blocks[blocks > 0]
 
         view = cpu.project(frozen, camera, settings, with_colour=bool(self._flags[0]))
