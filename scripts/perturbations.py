@@ -58,15 +58,19 @@ class NoisyDepths:
         self.backend, self.relative, self.seed = backend, relative, seed
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering:
-        drawn = self.backend.render(gaussians, camera, settings, passes)
+        drawn = self.backend.render(gaussians, camera, settings, passes, pixels)
         depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
         return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
 
     def drawing(self, gaussians: Gaussians, camera: Camera, *options: Any) -> NoisyDrawing:
-        window = options[-1] or (slice(0, camera.height), slice(0, camera.width))
-        return NoisyDrawing(self.backend.drawing(gaussians, camera, *options), self._factor(camera)[window])
+        return NoisyDrawing(self.backend.drawing(gaussians, camera, *options), self._factor(camera))
 
     def _factor(self, camera: Camera) -> np.ndarray:
         return 1 + self.relative * depth_errors(camera.id, camera.height, camera.width, self.seed)

@@ -56,6 +56,7 @@ def render(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> Rendering:
     """Draw a scene (paper eq. 1 and 2).
 
@@ -67,9 +68,9 @@ def render(
     Raises
     ------
     ValueError
-        If a pass is unknown.
+        If a pass is unknown, or the mask has not the picture's shape.
     """
-    return current_backend().render(gaussians, camera, settings, passes)
+    return current_backend().render(gaussians, camera, settings, passes, pixels)
 
 
 def trace(
@@ -119,14 +120,14 @@ def drawing(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     with_colour: bool = True,
-    window: Window | None = None,
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> Drawing:
-    """A view that is to be drawn in more than one way, or of which only a window is needed.
+    """A view that is to be drawn in more than one way: the Gaussians are projected and sorted once.
 
-    The Gaussians are projected and sorted once. A window's pixels are those of the whole picture, bit by bit. The
-    Gaussians' arrays must not change while it is in use, and it is not for two threads at once.
+    Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
+    while a drawing is in use, and it is not for two threads at once.
     """
-    return current_backend().drawing(gaussians, camera, settings, with_colour, window)
+    return current_backend().drawing(gaussians, camera, settings, with_colour, pixels)
 
 
 def footprint(
@@ -134,22 +135,24 @@ def footprint(
     camera: Camera,
     chosen: np.ndarray,  # [N] bool
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> np.ndarray:
     """Accumulated blend weight of the chosen Gaussians, [H, W] float32; others may hide them."""
-    return drawing(gaussians, camera, settings, with_colour=False).footprint(chosen)
+    return drawing(gaussians, camera, settings, False, pixels).footprint(chosen)
 
 
 def surface_depth(
     gaussians: Gaussians,
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha; both [H, W] float32.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
     splats (Yu 2024; Zhang 2024). 0 where alpha < 0.5.
     """
-    return drawing(gaussians, camera, settings, with_colour=False).surface_depth()
+    return drawing(gaussians, camera, settings, False, pixels).surface_depth()
 
 
 def contributions(

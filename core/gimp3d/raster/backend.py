@@ -33,11 +33,10 @@ class PixelRegion(Protocol):
 
 
 class Drawing(Protocol):
-    """A window of a view of a scene, made ready once and drawn in several ways; see `drawing`. All arrays are of the
-    window's size."""
+    """A view of a scene, made ready once and drawn in several ways; see `drawing`."""
 
-    def render(self, passes: frozenset[str], window: Window | None = None) -> Rendering:
-        """As `render`; `window` is a part of the drawing's own."""
+    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+        """As `render`; of the drawing's own pixels only those given."""
         ...
 
     def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +52,12 @@ class Backend(Protocol):
     """What a backend must do; the functions of this package say what each means. Arrays are NumPy's, in and out."""
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering: ...
 
     def trace(
@@ -75,7 +79,7 @@ class Backend(Protocol):
         camera: Camera,
         settings: RasterSettings,
         with_colour: bool,
-        window: Window | None,
+        pixels: np.ndarray | None,
     ) -> Drawing: ...
 
     def contributions(

@@ -443,7 +443,7 @@ def weigh_range(
             for y in range(min(BLOCK, height - top - BLOCK * (b >> 3))):
                 for x in range(min(BLOCK, width - left - BLOCK * (b & 7))):
                     label = int64(labels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x])
-                    if label:
+                    if 0 < label <= kinds:
                         state[k + COUNTED + 16 * (label - 1) + 4 * y + x] = ONE
         alive = open_blocks(labels, left, top, width, height)
         first, end, i = starts[slot], stops[slot], starts[slot]

@@ -33,7 +33,6 @@ FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
 CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
-BLOCK_ROWS = np.array([0x0101010101010101 & ((1 << 8 * n) - 1) for n in range(9)], np.uint64)  # first column's blocks
 NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
 
 
@@ -56,9 +55,9 @@ def project(
     settings: RasterSettings,
     with_colour: bool,
     out: View | None = None,
-    tiles: tuple[int, int, int, int] | None = None,
+    slots: np.ndarray | None = None,
 ) -> View:
-    """Feature rows of the Gaussians that reach the picture, or some of its tiles; into `out` where it is given."""
+    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `out` where it is given."""
     announce_compilation()
     n = len(gaussians)
     if out is None:
@@ -76,7 +75,7 @@ def project(
         sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
         pack_camera(camera),
         *tile_grid(camera),
-        np.array(tiles or (0, 0, *tile_grid(camera)), np.int64),
+        np.array((0, 0, *tile_grid(camera)) if slots is None else _rectangle(slots >= 0), np.int64),
         float(settings.near),
         float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
         float(settings.alpha_min),
@@ -87,6 +86,12 @@ def project(
         out.states,
     )
     return out
+
+
+def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """First column and row of what is set, and one past the last."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return (cols[0], rows[0], cols[-1] + 1, rows[-1] + 1) if len(rows) else (0, 0, 0, 0)
 
 
 def raw(values: np.ndarray) -> np.ndarray:
@@ -155,23 +160,44 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
     return raw(np.pad(picture, missing) if missing[0][1] or missing[1][1] else picture).reshape(-1)
 
 
-def as_rendering(
-    pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int, window: Window | None = None
-) -> Rendering:
-    """The kernels' pictures without what pads them to whole blocks, or a window of them."""
+def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
+    """The kernels' pictures without what pads them to whole blocks."""
     height, width = padded_size(camera)
     cut = []
     for flat, channels in zip(pictures, CHANNELS):
         picture = flat.reshape(height if len(flat) else 0, width if len(flat) else 0, channels)
-        picture = picture[window or whole(camera)]
+        picture = picture[: camera.height, : camera.width]
         cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
     rgb, alpha, expected, median, normals, distortion = cut
     return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
 
 
-def whole(camera: Camera) -> Window:
-    """All of a picture."""
-    return slice(0, int(camera.height)), slice(0, int(camera.width))
+def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
+    across, down = tile_grid(camera)
+    columns = np.minimum(-(-(camera.width - TILE * np.arange(across)) // 4), 8).astype(np.uint64)
+    rows = np.minimum(-(-(camera.height - TILE * np.arange(down)) // 4), 8).astype(np.uint64)
+    first_column = np.uint64(0x0101010101010101) >> (np.uint64(64) - np.uint64(8) * rows)
+    wanted = ((np.uint64(1) << columns) - np.uint64(1))[None] * first_column[:, None]
+    return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
+
+
+def wanted_tiles(camera: Camera, pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
+    if pixels is None:
+        return whole_picture(camera)
+    if pixels.shape != (camera.height, camera.width):
+        raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
+    blocks = wanted_blocks(camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
+    return slots_of(blocks > 0), blocks[blocks > 0]
+
+
+def wanted_blocks(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] uint8 which is not 0."""
+    across, down = tile_grid(camera)
+    blocks = np.empty(across * down, np.uint64)
+    region_blocks(pixels, across, blocks)
+    return blocks.reshape(down, across)
 
 
 def slots_of(
@@ -179,25 +205,6 @@ def slots_of(
 ) -> np.ndarray:
     """Slots [down, across] int32 of the wanted tiles in row-major order, −1 elsewhere."""
     return np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1).astype(np.int32)
-
-
-def window_tiles(window: Window) -> tuple[int, int, int, int]:
-    """First column and row of the tiles that a window meets, and one past the last."""
-    rows, cols = window
-    return cols.start // TILE, rows.start // TILE, -(-cols.stop // TILE), -(-rows.stop // TILE)
-
-
-def window_blocks(camera: Camera, window: Window) -> np.ndarray:
-    """The blocks of every tile that a window meets, [down, across] uint64."""
-    ends = []
-    for part, tiles in zip(window, tile_grid(camera)[::-1]):
-        blocks = np.array([[part.start // BLOCK], [-(-part.stop // BLOCK)]]) - TILE // BLOCK * np.arange(tiles)
-        ends.append(np.clip(blocks, 0, TILE // BLOCK))
-    (top, bottom), (left, right) = ends
-    one = np.uint64(1)
-    return (BLOCK_ROWS[bottom] - BLOCK_ROWS[top])[:, None] * (
-        (one << right.astype(np.uint64)) - (one << left.astype(np.uint64))
-    )
 
 
 @dataclass(frozen=True)
@@ -232,23 +239,33 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
-def render(gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]) -> Rendering:
-    return _draw(gaussians, camera, settings, passes, keep=False)[0]
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    pixels: np.ndarray | None,
+) -> Rendering:
+    return _draw(gaussians, camera, settings, passes, False, pixels)[0]
 
 
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    return _draw(gaussians, camera, settings, passes, keep=True)
+    return _draw(gaussians, camera, settings, passes, True, None)
 
 
 def _draw(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], keep: bool
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    keep: bool,
+    pixels: np.ndarray | None,
 ) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
-    view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
-    blocks = window_blocks(camera, whole(camera))
-    wanted, slots = blocks.ravel(), slots_of(blocks > 0)
+    slots, wanted = wanted_tiles(camera, pixels)
+    view = project(gaussians, camera, settings, bool(flags[0]), slots=slots)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = depth_shifts(lists, view.features)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
@@ -406,7 +423,7 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
 def contributions(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
 ) -> Contributions:
-    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels
+    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
     total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
     return Contributions(total[0], peak)
 
@@ -435,13 +452,10 @@ def _weigh(
     if labels.shape != shape:
         raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
-    across, down = tile_grid(camera)
     counted = np.require(labels, np.uint8, ["C", "W"])
-    blocks = np.empty(down * across, np.uint64)
-    region_blocks(counted, across, blocks)
-    wanted = (blocks > 0).reshape(down, across)
+    wanted = wanted_blocks(camera, counted) > 0
     if rows is not None:
-        touched = np.zeros((down, across), bool)
+        touched = np.zeros(wanted.shape, bool)
         mark_touched(view.rects, view.states, rows, touched)
         wanted &= touched
     lists = tile_lists(view.features, view.rects, view.states, slots_of(wanted), with_records=False)

@@ -15,7 +15,7 @@ from . import cpu
 from .bin import TileLists, tile_lists
 from .project import BLUE, RED
 from .surface import meet_range
-from .types import RasterSettings, Rendering, Window
+from .types import RasterSettings, Rendering
 
 NUMBERS_ONLY = np.array([False, False, True, False, False, True])  # blend_range's flags
 
@@ -29,35 +29,34 @@ class CpuDrawing:
         camera: Camera,
         settings: RasterSettings,
         with_colour: bool,
-        window: Window | None,
+        pixels: np.ndarray | None,
     ) -> None:
         self.gaussians, self.camera, self.settings, self.with_colour = gaussians, camera, settings, with_colour
-        self.window = window or cpu.whole(camera)
-        tiles = cpu.window_tiles(self.window)
-        self._view = cpu.project(gaussians, camera, settings, with_colour, tiles=tiles)
-        slots = cpu.slots_of(cpu.window_blocks(camera, self.window) > 0)
-        self._lists = tile_lists(self._view.features, self._view.rects, self._view.states, slots, with_records=False)
+        self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
+        self._view = cpu.project(gaussians, camera, settings, with_colour, slots=self._slots)
+        view = self._view
+        self._lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
 
-    def render(self, passes: frozenset[str], window: Window | None = None) -> Rendering:
+    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
         flags = cpu.pass_flags(passes)
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
-        return self._draw(flags, self.settings, self._lists, window or self.window)
+        if pixels is None:
+            return self._draw(flags, self.settings, self._lists, self._wanted)
+        blocks = cpu.wanted_blocks(self.camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
+        return self._draw(flags, self.settings, self._lists, self._wanted & blocks[self._slots >= 0])
 
     def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         lists = self._lists if gone is None else _without(self._lists, gone)
         if self.gaussians.is_surfels:
-            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self.settings, lists, self.window)
+            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self.settings, lists, self._wanted)
             return drawn.median_depth, drawn.alpha
-        drawn = self._draw(NUMBERS_ONLY, self.settings, lists, self.window)
-        numbers = drawn.median_depth.view(np.int32)
-        depth = zeros(numbers.shape, np.float32)
+        drawn = self._draw(NUMBERS_ONLY, self.settings, lists, self._wanted)
+        depth = zeros(drawn.alpha.shape, np.float32)
         run_ranges(
             meet_range,
             len(depth),
-            numbers,
-            float(self.window[1].start),
-            float(self.window[0].start),
+            drawn.median_depth.view(np.int32),
             cpu.raw(self.gaussians.means),
             cpu.raw(self.gaussians.log_scales),
             cpu.raw(self.gaussians.quats),
@@ -74,18 +73,16 @@ class CpuDrawing:
             raise ValueError("footprint: this drawing has colours; make one without")
         _paint(self._lists.entries, chosen, self._view.features)
         black = replace(self.settings, background=(0.0, 0.0, 0.0))
-        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), black, self._lists, self.window)
+        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), black, self._lists, self._wanted)
         return np.ascontiguousarray(drawn.rgb[..., 0])
 
-    def _draw(self, flags: np.ndarray, settings: RasterSettings, lists: TileLists, window: Window) -> Rendering:
-        """A window of the pictures."""
-        wanted = cpu.window_blocks(self.camera, window).ravel()[lists.tiles]
-        shifts = cpu.depth_shifts(lists, self._view.features)
-        features, view = self._view.features, self._view
+    def _draw(self, flags: np.ndarray, settings: RasterSettings, lists: TileLists, wanted: np.ndarray) -> Rendering:
+        view, features = self._view, self._view.features
+        shifts = cpu.depth_shifts(lists, features)
         pictures, _ = cpu.blend(
             self.gaussians, view, self.camera, settings, flags, features, lists, wanted, shifts, keep=False
         )
-        return cpu.as_rendering(pictures, self.camera, view.ignored, window)
+        return cpu.as_rendering(pictures, self.camera, view.ignored)
 
 
 def _without(lists: TileLists, gone: np.ndarray) -> TileLists:

@@ -24,8 +24,6 @@ def meet_range(
     lo,
     hi,
     numbers,  # [H, W] int32: 1 + the Gaussian that the pixel shows, 0 for none
-    left,  # px, of the first column and row in the camera's picture
-    top,
     means,  # [N, 3]
     log_scales,  # [N, 3]
     quats,  # [N, 4]
@@ -41,7 +39,7 @@ def meet_range(
     axes = np.empty((3, 5))  # of the Gaussian met last: direction, the centre along it, 1 / variance
     met, z, reach, flatness = int64(-1), 0.0, 0.0, 0.0
     for row in range(lo, hi):
-        dy = (top + row + 0.5 - cy) / fy
+        dy = (row + 0.5 - cy) / fy
         for column in range(numbers.shape[1]):
             i = int64(numbers[row, column]) - 1
             if i < 0:
@@ -67,7 +65,7 @@ def meet_range(
                     least, most, total = min(least, variance), max(most, variance), total + variance
                 reach = REACH * math.sqrt(spread)
                 flatness = 1.0 - least / max(total - least - most, least)
-            dx = (left + column + 0.5 - cx) / fx
+            dx = (column + 0.5 - cx) / fx
             along, squared = 0.0, 0.0
             for k in range(3):  # the ray and the centre in units of the standard deviation along each axis
                 ray = axes[k, 0] * dx + axes[k, 1] * dy + axes[k, 2]

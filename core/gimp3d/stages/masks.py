@@ -25,6 +25,7 @@ from .outline import (
     fill_polygon,
     guard_gaussians,
     surface_points,
+    window_mask,
     window_round,
 )
 from .selection import (
@@ -269,7 +270,7 @@ def _look(
     scene = drawing(gaussians, camera, with_colour=compare)
     depth, alpha = scene.surface_depth()
     if photo is not None and compare:
-        drawn = np.clip(scene.render(frozenset({"rgb"}), window).rgb, 0, 1)
+        drawn = np.clip(scene.render(frozenset({"rgb"}), window_mask(window, camera)).rgb[window], 0, 1)
         shown = photo[window] / np.float32(255)
         misfit = np.abs(drawn - shown).max(-1)
         limit = max(settings.selection.least_misfit, settings.selection.misfit * float(np.median(misfit)))
@@ -338,8 +339,9 @@ def _without(
 ) -> _After:
     """A view without the object; only the part that the object touched is drawn anew."""
     window = touched_window(gone, view.camera, settings.around)
-    scene = drawing(gaussians, view.camera, with_colour=False, window=window)
-    return _After(window, *scene.surface_depth(gone=removed), scene.footprint(removed))
+    scene = drawing(gaussians, view.camera, with_colour=False, pixels=window_mask(window, view.camera))
+    depth, alpha, weight = (*scene.surface_depth(gone=removed), scene.footprint(removed))
+    return _After(window, depth[window].copy(), alpha[window].copy(), weight[window].copy())
 
 
 def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.ndarray:

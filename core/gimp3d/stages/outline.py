@@ -102,9 +102,15 @@ def box_window(box: Box, camera: Camera) -> Window:
     return window_round(camera.project(corners)[0], camera, 1)
 
 
+def window_mask(window: Window, camera: Camera) -> np.ndarray:
+    """[H, W] bool: the pixels of a view that lie in a window."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[window] = True
+    return mask
+
+
 def cropped(camera: Camera, window: Window) -> Camera:
-    """The part of a view in a window, with exact intrinsics, for points; a scene is drawn a little differently there
-    than by `drawing` with a window, which gives the whole view's own pixels."""
+    """The part of a view in a window, with exact intrinsics."""
     rows, cols = window
     return replace(
         camera,

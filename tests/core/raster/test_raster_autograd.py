@@ -167,7 +167,12 @@ class FakeBackend:
     traces: list[FakeTrace] = field(default_factory=list)
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None = None,
     ) -> Rendering:
         self.seen.append(gaussians)
         size = (camera.height, camera.width)
