@@ -18,14 +18,14 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, footprint, render, surface_depth
+from .raster import RasterSettings, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
-from .stages.outline import gaussians_window, window_mask
+from .stages.outline import window_mask
 from .stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -497,8 +497,7 @@ def _appearance(
 
 def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
     """ID → [H, W] bool: where a view may show the Gaussians."""
-    cameras = [v.camera for v in views]
-    return {c.id: window_mask(gaussians_window(gaussians, c, 0), c) for c in cameras}
+    return {v.camera.id: window_mask(touched_window(gaussians, v.camera), v.camera) for v in views}
 
 
 def _redrawn(
@@ -556,9 +555,10 @@ def _still_open(
     new[-added:] = True
     side = 2 * masks.margin + 1
     near = touched | (cv2.dilate(view.target.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
-    covered = footprint(filled, view.camera, new, pixels=near) > 0.5
-    drawn = surface_depth(filled, view.camera, pixels=touched)
-    depth, alpha = (np.where(touched, d, b) for d, b in zip(drawn, (view.depth_after, view.alpha_after)))
+    scene = drawing(filled, view.camera, with_colour=False, pixels=near)
+    before = view.depth_after, view.alpha_after
+    depth, alpha = (np.where(touched, d, b) for d, b in zip(scene.surface_depth(), before))
+    covered = scene.footprint(new) > 0.5
     coloured = (rules != Rule.UNREACHED) | (view.alpha_after > masks.solid)
     target = view.target & (~covered | (rules == Rule.UNREACHED))
     farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))

@@ -12,9 +12,9 @@ from scenes import discs as discs_on
 
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import _redrawn, _still_open, render_bytes
-from gimp3d.raster import footprint, surface_depth
+from gimp3d.raster import footprint, surface_depth, touched_window
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
-from gimp3d.stages.outline import gaussians_window, window_mask
+from gimp3d.stages.outline import window_mask
 from gimp3d.stages.propagate import Rule
 
 SETTINGS = MaskSettings()
@@ -57,7 +57,7 @@ def patch(least_x: float = -BLOCK / 2) -> Gaussians:
 
 def opened(new: Gaussians, rules: np.ndarray) -> ViewMasks:
     camera = view().camera
-    touched = window_mask(gaussians_window(new, camera, 0), camera)
+    touched = window_mask(touched_window(new, camera), camera)
     return _still_open(view(), floor(with_hole=True).extended(new), len(new), rules, touched, SETTINGS)
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from ..camera import Camera
 from ..gaussians import Gaussians
 from . import cpu
+from .cpu_drawing import CpuDrawing
 from .region import CpuPixelRegion
-from .surface import surface_depth
-from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering
+from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
 
 
 class Trace(Protocol):
@@ -29,6 +29,22 @@ class PixelRegion(Protocol):
 
     def trace(self, active: Gaussians) -> tuple[Rendering, Trace]:
         """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
+        ...
+
+
+class Drawing(Protocol):
+    """A view of a scene, made ready once and drawn in several ways; see `drawing`."""
+
+    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+        """As `render`; of the drawing's own pixels only those given."""
+        ...
+
+    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """As `surface_depth`, without some Gaussians ([N] bool)."""
+        ...
+
+    def footprint(self, chosen: np.ndarray) -> np.ndarray:
+        """As `footprint`; only for drawings without colours."""
         ...
 
 
@@ -57,22 +73,30 @@ class Backend(Protocol):
         passes: frozenset[str],
     ) -> PixelRegion: ...
 
-    def footprint(
+    def drawing(
         self,
         gaussians: Gaussians,
         camera: Camera,
-        chosen: np.ndarray,
         settings: RasterSettings,
+        with_colour: bool,
         pixels: np.ndarray | None,
-    ) -> np.ndarray: ...
-
-    def surface_depth(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]: ...
+    ) -> Drawing: ...
 
     def contributions(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
     ) -> Contributions: ...
+
+    def label_weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: np.ndarray,
+        count: int,
+        rows: np.ndarray | None,
+    ) -> np.ndarray: ...
+
+    def touched_window(self, gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window: ...
 
 
 class CpuBackend:
@@ -81,9 +105,10 @@ class CpuBackend:
     render = staticmethod(cpu.render)
     trace = staticmethod(cpu.trace)
     pixel_region = staticmethod(CpuPixelRegion)
-    footprint = staticmethod(cpu.footprint)
-    surface_depth = staticmethod(surface_depth)
+    drawing = staticmethod(CpuDrawing)
     contributions = staticmethod(cpu.contributions)
+    label_weights = staticmethod(cpu.label_weights)
+    touched_window = staticmethod(cpu.touched_window)
 
 
 _current: Backend = CpuBackend()

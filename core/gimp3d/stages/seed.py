@@ -12,11 +12,11 @@ import numpy as np
 from ..camera import Camera
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
-from ..raster import PictureGradients, RasterSettings, contributions, pixel_region
+from ..raster import PictureGradients, RasterSettings, contributions, pixel_region, touched_window
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
 from .masks import sees
-from .outline import cropped, gaussians_window, window_mask
+from .outline import cropped, window_mask
 from .propagate import PaintedView, Rule
 from .reference import surface_normals
 
@@ -255,7 +255,7 @@ def settle_gaussians(
     joined = scene.extended(new)
 
     def peak(camera: Camera) -> np.ndarray:
-        there = window_mask(gaussians_window(new, camera, 0), camera)
+        there = window_mask(touched_window(new, camera), camera)
         return contributions(joined, camera, pixels=there).peak[len(scene) :]
 
     peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
