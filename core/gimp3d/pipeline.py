@@ -345,8 +345,10 @@ def _fill_from_one_view(
 
     def to_paint(v: ViewMasks) -> ViewToPaint:
         name = v.camera.id
-        near = window_mask(near_hole(v.target, settings.propagate), v.camera)
-        depth_new = surface_depth(with_seeds, v.camera, pixels=near)[0]
+        window = near_hole(v.target, settings.propagate)
+        depth_new = np.zeros_like(v.depth_before)
+        if v.target.any():
+            depth_new = surface_depth(with_seeds, v.camera, pixels=window_mask(window, v.camera))[0]
         return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
@@ -497,7 +499,8 @@ def _appearance(
 
 def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
     """ID → [H, W] bool: where a view may show the Gaussians."""
-    return {v.camera.id: window_mask(touched_window(gaussians, v.camera), v.camera) for v in views}
+    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
+    return dict(zip((v.camera.id for v in views), windows))
 
 
 def _redrawn(
