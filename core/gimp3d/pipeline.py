@@ -21,7 +21,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
-from .stages.exposure import level_exposure
+from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -226,13 +226,19 @@ def remove_object(
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
-    drawn = {v.camera.id: render_bytes(kept, v.camera) for v in masks.views}
-    exposures = {v.camera.id: level_exposure(v, photos[v.camera.id], drawn[v.camera.id]) for v in masks.views}
+
+    def emptied(v: ViewMasks) -> tuple[Exposure, np.ndarray]:
+        """A view's photo at the splats' exposure, and with the emptied scene in the object's place."""
+        silhouette, ring = v.silhouette, exposure_ring(v)
+        drawn = render_bytes(kept, v.camera, pixels=silhouette | ring)
+        exposure = level_exposure(ring, photos[v.camera.id], drawn)
+        return exposure, np.where(silhouette[..., None], drawn, exposure.image)
+
+    names = [v.camera.id for v in masks.views]
+    found = parallel_map(emptied, masks.views)
+    exposures, painted = {n: e for n, (e, _) in zip(names, found)}, {n: p for n, (_, p) in zip(names, found)}
+    del found
     levelled = {name: e.image for name, e in exposures.items()}
-    painted = {
-        v.camera.id: np.where(v.silhouette[..., None], drawn[v.camera.id], levelled[v.camera.id]) for v in masks.views
-    }
-    del drawn
     filled, added = kept, None
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
@@ -272,10 +278,8 @@ def remove_object(
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
-    painted = {
-        name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
-        for name, v in ((v.camera.id, v) for v in masks.views)
-    }
+    for name, v in zip(names, masks.views):
+        painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
@@ -476,7 +480,7 @@ def _appearance(
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
-        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
+        sources = ((v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views)
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
