@@ -21,7 +21,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
-from .stages.exposure import Exposure, level_exposure
+from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
@@ -232,17 +232,18 @@ def remove_object(
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
 
-    def emptied(view: ViewMasks) -> tuple[Exposure, np.ndarray]:
-        """The photo at the splats' exposure, and as it is without the object, as far as that is known."""
-        drawn = render_bytes(kept, view.camera)
-        exposure = level_exposure(view, photos[view.camera.id], drawn)
-        return exposure, np.where(view.silhouette[..., None], drawn, exposure.image)
+    def emptied(v: ViewMasks) -> tuple[Exposure, np.ndarray]:
+        """A view's photo at the splats' exposure, and with the emptied scene in the object's place."""
+        silhouette, ring = v.silhouette, exposure_ring(v)
+        drawn = render_bytes(kept, v.camera, pixels=silhouette | ring)
+        exposure = level_exposure(ring, photos[v.camera.id], drawn)
+        return exposure, np.where(silhouette[..., None], drawn, exposure.image)
 
     names = [v.camera.id for v in masks.views]
-    emptied_views = parallel_map(emptied, masks.views)
-    exposures = dict(zip(names, (e for e, _ in emptied_views)))
+    found = parallel_map(emptied, masks.views)
+    exposures, painted = {n: e for n, (e, _) in zip(names, found)}, {n: p for n, (_, p) in zip(names, found)}
+    del found
     levelled = {name: e.image for name, e in exposures.items()}
-    painted = dict(zip(names, (picture for _, picture in emptied_views)))
     filled, added = kept, None
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
@@ -283,11 +284,11 @@ def remove_object(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
 
-    def finished(view: ViewMasks) -> np.ndarray:
-        name = view.camera.id
-        return exposures[name].back(painted[name], photos[name], view.silhouette | view.target)
+    def finish(v: ViewMasks) -> None:
+        name = v.camera.id
+        painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
 
-    painted = dict(zip(names, parallel_map(finished, masks.views)))
+    parallel_map(finish, masks.views)
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
@@ -487,7 +488,7 @@ def _appearance(
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
-        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
+        sources = ((v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views)
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)

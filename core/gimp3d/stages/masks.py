@@ -79,7 +79,11 @@ class MaskSettings:
 
 @dataclass(frozen=True)
 class ViewMasks:
-    """What a view shows before and after the removal; all arrays [H, W] of the view."""
+    """What a view shows before and after the removal; all arrays [H, W] of the view.
+
+    Hundreds of these are held at once, so all but `depth_before` and `alpha_after` are kept small and made anew each
+    time they are read.
+    """
 
     camera: Camera
     polygon: np.ndarray  # bool, the projected boxes
@@ -89,6 +93,46 @@ class ViewMasks:
     depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing, or nothing to be trusted
     depth_after: np.ndarray  # float32 z without it
     alpha_after: np.ndarray  # float32
+
+
+class _Bits:
+    """A field of ViewMasks that is a bool picture: kept as bits."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __set__(self, view: ViewMasks, mask: np.ndarray) -> None:
+        view.__dict__[self.name] = np.packbits(mask, axis=1), mask.shape[1]
+
+    def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
+        bits, width = view.__dict__[self.name]
+        return np.unpackbits(bits, axis=1, count=width).view(bool)
+
+
+class _LikeBefore:
+    """A field of ViewMasks that is a depth map: only the rectangle is kept in which it is not `depth_before`."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __set__(self, view: ViewMasks, depth: np.ndarray) -> None:
+        other = depth != view.depth_before
+        rows, cols = np.flatnonzero(other.any(1)), np.flatnonzero(other.any(0))
+        window = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] if len(rows) else np.s_[:0, :0]
+        view.__dict__[self.name] = window, depth[window].copy()
+
+    def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
+        window, values = view.__dict__[self.name]
+        depth = view.depth_before.copy()
+        depth[window] = values
+        return depth
+
+
+for _name, _kept in (
+    *((n, _Bits) for n in ("polygon", "silhouette", "occluder", "target")),
+    ("depth_after", _LikeBefore),
+):
+    setattr(ViewMasks, _name, _kept(_name))
 
 
 @dataclass(frozen=True)

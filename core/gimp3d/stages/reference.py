@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -257,7 +257,7 @@ def gather_evidence(
     camera: Camera,  # the reference
     depth: np.ndarray,  # [H, W] its completed z-depth
     target: np.ndarray,  # [H, W] bool, T_0
-    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
+    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
     settings: EvidenceSettings = EvidenceSettings(),
 ) -> Evidence:
     """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.

@@ -15,7 +15,7 @@ from ..box import Region, in_region
 from ..camera import Camera
 from ..gaussians import Gaussians, quats_to_matrices
 from ..raster import label_weights
-from ..threads import parallel_map
+from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 from .surroundings import Surroundings, SurroundingsSettings
 
@@ -126,7 +126,9 @@ class Weights:
 
 def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
     """[N] bool: Gaussians whose centre lies in the region. Unusable rows are never removed."""
-    return in_region(region, gaussians.means.astype(np.float64)) & gaussians.usable
+    inside = in_region(region, gaussians.means.astype(np.float64))
+    inside[inside] = gaussians.take(inside).usable
+    return inside
 
 
 def by_centre(
@@ -262,7 +264,8 @@ def select(
     on_object = weights.object_ / np.maximum(shown, 1e-9)
     visible = shown > settings.shown
     centre = select_removed(gaussians, region)
-    rows = np.flatnonzero(_reaches(gaussians, region) & gaussians.usable)
+    usable = gaussians.usable
+    rows = np.flatnonzero(_reaches(gaussians, region) & usable)
     mass = np.zeros(len(gaussians))
     mass[rows] = mass_inside(gaussians, rows, region)
     fates = np.zeros(len(gaussians), np.uint8)
@@ -279,7 +282,7 @@ def select(
         surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
         fates[inside[surface & clean]] = Fate.KEPT_SURFACE
     under_masks = weights.masked > np.maximum(settings.shown, settings.mostly * (weights.masked + weights.unmasked))
-    fates[under_masks & gaussians.usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
+    fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
 
 
@@ -345,14 +348,17 @@ def mass_inside(
     uniform = (0.5 + np.outer(np.arange(samples), PLASTIC ** -np.arange(1.0, 4.0))) % 1
     normal = ndtri(uniform)
     inside = np.empty(len(rows))
-    for start in range(0, len(rows), 4096):
-        part = rows[start : start + 4096]
-        scales = gaussians.scales[part].astype(np.float64)
+
+    def work(lo: int, hi: int) -> None:
+        part = rows[lo:hi]
+        scales = np.exp(gaussians.log_scales[part]).astype(np.float64)
         axes = quats_to_matrices(gaussians.quats[part].astype(np.float64))[:, :, : scales.shape[1]]
         points = (
             np.einsum("mik,mk,sk->msi", axes, scales, normal[:, : scales.shape[1]]) + gaussians.means[part][:, None]
         )
-        inside[start : start + 4096] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
+        inside[lo:hi] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
+
+    run_ranges(work, len(rows), chunk=1024)
     return inside
 
 
