@@ -46,7 +46,12 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.refine import Refinement, RefineSettings, observed, refine_gaussians, torch_is_there
+from .stages.refine import (
+    Refinement,
+    RefineSettings,
+    observed,
+    refine_gaussians,
+)
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
@@ -270,7 +275,7 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
-        near_new = {v.camera.id: window_mask(touched_window(new, v.camera), v.camera) for v in masks.views}
+        near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
@@ -278,8 +283,12 @@ def remove_object(
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
-    for name, v in zip(names, masks.views):
+
+    def finish(v: ViewMasks) -> None:
+        name = v.camera.id
         painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
+
+    parallel_map(finish, masks.views)
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
@@ -292,11 +301,8 @@ def _refined(
     told: dict[str, np.ndarray],
     settings: RemovalSettings,
 ) -> Gaussians | None:
-    """The new Gaussians, optimised where the settings ask for it and torch is there."""
+    """The new Gaussians, optimised where the settings ask for it."""
     if added is None or not settings.refine.steps:
-        return added
-    if not torch_is_there():
-        run.warnings.append("torch is not installed: the new Gaussians are not refined, as in the preset draft")
         return added
     views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
     refinement: Refinement = run(
@@ -340,8 +346,10 @@ def _fill_from_one_view(
 
     def to_paint(v: ViewMasks) -> ViewToPaint:
         name = v.camera.id
-        near = window_mask(near_hole(v.target, settings.propagate), v.camera)
-        depth_new = surface_depth(with_seeds, v.camera, pixels=near)[0]
+        window = near_hole(v.target, settings.propagate)
+        depth_new = np.zeros_like(v.depth_before)
+        if v.target.any():
+            depth_new = surface_depth(with_seeds, v.camera, pixels=window_mask(window, v.camera))[0]
         return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
@@ -488,6 +496,12 @@ def _appearance(
     filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
+
+
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
+    """ID → [H, W] bool: where a view may show the Gaussians."""
+    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
+    return dict(zip((v.camera.id for v in views), windows))
 
 
 def _redrawn(

@@ -67,6 +67,8 @@ def seed_gaussians(
     """
     if settings.largest < 1 or settings.largest & (settings.largest - 1):
         raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")
+    part = _grid_round(target, settings.largest)
+    camera, image, depth, target = cropped(camera, part), image[part], depth[part], target[part]
     normals = surface_normals(camera, depth)
     there = target & (depth > 0) & (np.abs(normals).sum(-1) > 0)
     z = np.where(there, depth, 1.0).astype(np.float64)
@@ -97,6 +99,16 @@ def seed_gaussians(
         opacity_logits=np.full(len(z), np.log(settings.opacity / (1 - settings.opacity)), np.float32),
         sh=((colours / 255.0 - 0.5) / SH_C0)[:, None].astype(np.float32),
     )
+
+
+def _grid_round(target: np.ndarray, size: int) -> tuple[slice, slice]:
+    """Rows and columns of the squares of a grid that hold the target [H, W] bool, and of one more all round."""
+    ends = ((np.flatnonzero(target.any(1 - axis)), side) for axis, side in enumerate(target.shape))
+    rows, cols = (
+        slice(max(0, x[0] // size - 1) * size, min(side, (x[-1] // size + 2) * size)) if len(x) else slice(0, size)
+        for x, side in ends
+    )
+    return rows, cols
 
 
 def _patches(
