@@ -4,7 +4,8 @@
 
 The paper names this as future work. A segment is a connected part of the hole whose sources lie together; the rigid
 motion that takes the sources' points on the surface to the segment's (Kabsch 1976) takes their Gaussians along, with
-their spherical harmonics. The first reference's hole alone is filled. Docs tell why the core does not do this.
+their spherical harmonics. The first reference's hole alone is filled. Seeds' colours are
+settled, copies' are not.
 """
 
 from __future__ import annotations

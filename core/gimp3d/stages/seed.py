@@ -22,6 +22,8 @@ from .propagate import PaintedView, Rule
 from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
+SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all
+CUT = 9.0  # of the usual miss of a view at a Gaussian (6 σ): what is missed by more is a wrong picture
 LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
 
 
@@ -305,20 +307,26 @@ def _colour_change(
     degree: int,
     hold: float,  # weight by which each coefficient is held
 ) -> np.ndarray:
-    """What must be added to the coefficients, [N, K, 3]: least squares with a ridge, over the views' directions.
+    """What must be added to the coefficients, [N, K, 3]: robust least squares with a ridge, over the views' directions.
 
     The basis is taken less its mean over the views, so that what all of them miss is no view dependence, and few
-    directions, or near ones, tell c_0 alone.
+    directions, or near ones, tell c_0 alone. What a view misses by far more than is usual counts little (Geman and
+    McClure 1987): its photo is wrong there.
     """
     weights = [w[:, :1] for w, _ in steps]
+    misses = [np.linalg.norm(m, axis=1, keepdims=True) / np.maximum(w, SHOWN) for w, (_, m) in zip(weights, steps)]
+    shown = np.concatenate(weights) > SHOWN
+    usual = max(1e-6, float(np.median(np.concatenate(misses)[shown]))) if shown.any() else 1.0
+    trust = [1 / (1 + (m / (CUT * usual)) ** 2) ** 2 for m in misses]
+    weights = [w * t for w, t in zip(weights, trust)]
     bases = [sh_basis(t, degree) / SH_C0 for t in towards]
     middle = sum(w * y for w, y in zip(weights, bases)) / np.maximum(sum(weights), 1e-9)
     middle[:, 0] = 0.0
     normal, right = hold * np.eye(middle.shape[1]), np.zeros(())
-    for w, y, (_, missing) in zip(weights, bases, steps):
+    for w, y, t, (_, missing) in zip(weights, bases, trust, steps):
         apart = y - middle
         normal = normal + (w * apart)[:, :, None] * apart[:, None]
-        right = right + apart[:, :, None] * missing[:, None]
+        right = right + apart[:, :, None] * (t * missing)[:, None]
     change = np.linalg.solve(normal, right)
     change[:, 0] -= (middle[..., None] * change).sum(1)
     return change

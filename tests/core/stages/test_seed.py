@@ -20,6 +20,7 @@ from gimp3d.raster import render
 from gimp3d.solvers.harmonics import HarmonicsSettings, sh_basis
 from gimp3d.stages.propagate import PaintedView, Rule, ViewToPaint
 from gimp3d.stages.seed import (
+    CUT,
     SeedSettings,
     _colour_change,
     _patches,
@@ -297,14 +298,27 @@ def test_what_each_view_misses_tells_view_dependence_and_what_all_miss_does_not(
 
 def test_few_or_near_views_tell_the_constant_alone() -> None:
     rng = np.random.default_rng(0)
-    steps = [(np.full((5, 3), 4.0), rng.normal(size=(5, 3))) for _ in range(3)]
+    steps = [(np.full((5, 3), 4.0), rng.choice([-1, 1], (5, 3)) * np.ones((5, 3))) for _ in range(3)]
     towards = np.tile([0.0, 0.6, 0.8], (5, 1))
     same = _colour_change(steps, [towards] * 3, 2, 3.0)
     assert same.shape == (5, 9, 3)
-    np.testing.assert_allclose(same[:, 0], sum(m for _, m in steps) / (12 + 3))
+    trust = 1 / (1 + 1 / CUT**2) ** 2  # all miss as much as is usual
+    np.testing.assert_allclose(same[:, 0], trust * sum(m for _, m in steps) / (trust * 12 + 3))
     np.testing.assert_allclose(same[:, 1:], 0, atol=1e-12)
     nobody = _colour_change([(0 * w, 0 * m) for w, m in steps], [towards] * 3, 2, 3.0)
     np.testing.assert_array_equal(nobody, 0)
+
+
+def test_a_wrong_picture_tells_next_to_nothing() -> None:
+    rng = np.random.default_rng(1)
+    towards = rng.normal(size=(12, 6, 3))
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    steps = [(np.full((6, 3), 9.0), 9 * (0.02 + 0.03 * t[:, :1]) * np.ones((6, 3))) for t in towards]
+    right = _colour_change(steps, list(towards), 1, 0.01)
+    wrong = _colour_change([*steps[:-1], (steps[-1][0], np.full((6, 3), 9 * 2.0))], list(towards), 1, 0.01)
+    shown = np.einsum("nk,nkc->nc", sh_basis(towards[0], 1), right) / SH_C0
+    np.testing.assert_allclose(shown, 0.02 + 0.03 * towards[0][:, :1] * np.ones((6, 3)), atol=2e-3)
+    assert np.abs(wrong - right).max() < 0.2 * np.abs(right).max()
 
 
 def test_the_papers_constant_lacks_what_3dgs_adds() -> None:
