@@ -44,6 +44,7 @@ def gather_depth_evidence(
     view: ViewMasks,  # the reference
     views: Sequence[ViewMasks],  # the others; the reference among them does not count
     settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+    ring: np.ndarray | None = None,  # [H, W] bool, pixels off the hole that are asked about too
 ) -> DepthEvidence:
     """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
 
@@ -52,7 +53,8 @@ def gather_depth_evidence(
     views gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
     """
     others = [v for v in views if v.camera.id != view.camera.id]
-    samples = parallel_map(lambda v: _samples(v, view, settings), others)
+    asked = view.target if ring is None else view.target | ring
+    samples = parallel_map(lambda v: _samples(v, view, asked, settings), others)
     h, w = view.target.shape
     found, count = np.zeros(h * w), np.zeros(h * w)
     pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
@@ -75,16 +77,19 @@ def gather_depth_evidence(
     return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
 
 
-def _samples(other: ViewMasks, view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
-    """[2, M]: pixels of the reference's hole (flat indices) and the disparities that a view measured there."""
+def _samples(
+    other: ViewMasks, view: ViewMasks, asked: np.ndarray, settings: DepthEvidenceSettings
+) -> np.ndarray:
+    """[2, M]: pixels asked about in the reference (flat indices) and the disparities that a view measured there."""
     width = view.target.shape[1]
     rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))
     points = other.camera.unproject(
         np.stack([cols + 0.5, rows + 0.5], -1), other.depth_before[rows, cols].astype(float)
     )
     _, cols, rows, z = _framed(view.camera, points)
-    front = view.depth_before[rows, cols]  # nothing of the background lies before what the reference itself sees
-    there = view.target[rows, cols] & (z > (1 - settings.beyond) * front)
+    # Nothing that the object hides lies before the object itself.
+    front = np.where(view.target, (1 - settings.beyond) * view.depth_before, 0)[rows, cols]
+    there = asked[rows, cols] & (z > front)
     return np.stack([rows[there] * width + cols[there], 1 / z[there]])
 
 

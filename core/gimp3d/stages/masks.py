@@ -68,6 +68,7 @@ class MaskSettings:
     occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
     infinity: float = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
+    least_border: float = 0.25  # and times `around` and the root of what the object covers of it: leaks have a narrow rim
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
     least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
@@ -415,7 +416,8 @@ def _continues_outside(
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
-    by other views past the table's edge, but it is not what was behind the object.
+    by other views past the table's edge, but it is not what was behind the object. Tables of rough scans leak beside the
+    object too, but little, for all that shows behind it.
     """
     z, void = depth, alpha < settings.void
     there = (z > 0) & (alpha >= settings.solid) | void
@@ -431,7 +433,9 @@ def _continues_outside(
     count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
     surface = surface.reshape(z.shape)
     outside = np.bincount(surface[there & ~touched], minlength=count)
-    return there & (outside[surface] >= settings.least_outside)
+    covered = np.bincount(surface[there & touched], minlength=count)
+    enough = np.maximum(settings.least_outside, settings.least_border * settings.around * np.sqrt(covered))
+    return there & (outside >= enough)[surface]
 
 
 def sees(
