@@ -61,10 +61,11 @@ def complete_depth(
     ring = known & (distance_to(view.target) <= settings.planes.ring)
     measured = gather_depth_evidence(view, views, settings.evidence, ring)
     fallen = ring & (disparity < (1 - settings.evidence.agreement) * measured.disparity)
-    known, ring = known & ~fallen, ring & ~fallen
+    mostly = replace(settings.layers, front_share=0.5)
+    known = without_front(disparity, known, view.target, fallen, mostly) & ~fallen
     evidence = _without(measured, ~view.target)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
-    space = free_space(view, views, ring, settings.evidence)
+    space = free_space(view, views, ring & known, settings.evidence)
 
     def complete(evidence: DepthEvidence | None) -> DepthCompletion:
         return complete_disparity(disparity, known, view.target, relative, settings, evidence)

@@ -77,9 +77,7 @@ def gather_depth_evidence(
     return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
 
 
-def _samples(
-    other: ViewMasks, view: ViewMasks, asked: np.ndarray, settings: DepthEvidenceSettings
-) -> np.ndarray:
+def _samples(other: ViewMasks, view: ViewMasks, asked: np.ndarray, settings: DepthEvidenceSettings) -> np.ndarray:
     """[2, M]: pixels asked about in the reference (flat indices) and the disparities that a view measured there."""
     width = view.target.shape[1]
     rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))

@@ -120,23 +120,24 @@ def choose_plan(
     plain = Plan(_layers(around, (), kind == "smooth", settings), kind, words)
     if settings.surface not in ("auto", "planar") or not around.touching.any():
         return plain
-    for tolerance in settings.tolerances:  # a rough scan's table is a plane too
+    share = 0.0
+    for tolerance in settings.tolerances:  # a rough scan's table is a plane too, and its lesser steps are noise
         own = replace(settings.planes, inlier=tolerance * settings.planes.inlier)
         planar = planar_surfaces(around.disparity, around.measured, around.distance, own)
-        if planar.share >= settings.plane_share:
-            break
-    else:
-        if settings.surface == "planar" and insist:
-            raise IllPosed(f"depth: only {planar.share:.0%} of the surroundings lie on planes; use --depth-prior auto")
-        return plain
-    # In a rough scan, lesser steps are noise as well.
-    rough = replace(settings, layers=replace(settings.layers, step=tolerance * settings.layers.step))
-    planes = Plan(_layers(around, planar.surfaces, True, rough), kind, planar.reason)
-    if settings.surface == "planar":
-        return planes
-    on_planes = np.any([layer.on for layer in planes.layers if layer.surface is not None], axis=0)
-    misses = [withheld_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
-    return plain if misses[0] > settings.plane_trust * misses[1] else planes
+        share = max(share, planar.share)
+        if planar.share < settings.plane_share:
+            continue
+        rough = replace(settings, layers=replace(settings.layers, step=tolerance * settings.layers.step))
+        planes = Plan(_layers(around, planar.surfaces, True, rough), kind, planar.reason)
+        if settings.surface == "planar":
+            return planes
+        on_planes = np.any([layer.on for layer in planes.layers if layer.surface is not None], axis=0)
+        misses = [withheld_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
+        if not misses[0] > settings.plane_trust * misses[1]:
+            return planes
+    if settings.surface == "planar" and insist:
+        raise IllPosed(f"depth: only {share:.0%} of the surroundings lie on planes; use --depth-prior auto")
+    return plain
 
 
 def _layers(
