@@ -18,7 +18,7 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, drawing, render, surface_depth, touched_window
+from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
@@ -508,7 +508,7 @@ def _redrawn(
     painted: dict[str, np.ndarray],
     filled: Gaussians,
     views: Sequence[ViewMasks],
-    touched: dict[str, np.ndarray],  # ID → [H, W] bool, where the last new Gaussians may be
+    touched: dict[str, Window],  # by ID, where the last new Gaussians may be
 ) -> dict[str, np.ndarray]:
     """The painted views, with the filled scene where the removal left a gap that was never to be filled.
 
@@ -517,7 +517,12 @@ def _redrawn(
 
     def redraw(view: ViewMasks) -> np.ndarray:
         picture = painted[view.camera.id]
-        gap = view.silhouette & ~view.target & (view.alpha_after < 0.99) & touched[view.camera.id]
+        gap = (
+            view.silhouette
+            & ~view.target
+            & (view.alpha_after < 0.99)
+            & window_mask(touched[view.camera.id], view.camera)
+        )
         if not gap.any():
             return picture
         return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
@@ -530,13 +535,14 @@ def _all_still_open(
     filled: Gaussians,
     added: int,
     rules: dict[str, np.ndarray],
-    touched: dict[str, np.ndarray],
+    touched: dict[str, Window],
     masks: MaskSettings,
 ) -> tuple[ViewMasks, ...]:
     def left(view: ViewMasks) -> ViewMasks:
         if not view.target.any():
             return view
-        return _still_open(view, filled, added, rules[view.camera.id], touched[view.camera.id], masks)
+        name = view.camera.id
+        return _still_open(view, filled, added, rules[name], window_mask(touched[name], view.camera), masks)
 
     return tuple(parallel_map(left, views))
 

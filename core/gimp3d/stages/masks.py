@@ -70,8 +70,12 @@ class MaskSettings:
     occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
     infinity: float = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
+    least_border: float = (
+        0.25  # and times `around` and the root of what the object covers of it: leaks have a narrow rim
+    )
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
+    usual_agreement: float = 0.97  # share of surface that two views of a good scan place alike
     least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
     least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
     selection: SelectionSettings = SelectionSettings()
@@ -196,14 +200,18 @@ def find_masks(
         )
     passes = _Passes(progress, 3 * len(seeing))
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
+    agreement = depth_agreement(seeing, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance)
     selection = by_centre(inside)
     if not settings.selection.by_centre:
-        selection, before = _choose(gaussians, region, before, passes, settings.selection)
+        # Where views disagree on what they see, trainers have left that much more smears behind the object.
+        lacking = max(0.0, settings.usual_agreement - agreement)
+        rough = replace(settings.selection, support=settings.selection.support and settings.selection.support + lacking)
+        selection, before = _choose(gaussians, region, before, passes, rough)
     gone = gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, gone, selection.removed, b, settings), before)
     centre = np.mean([box.center for box in region], axis=0)
     sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)], centre)
-    mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
+    mode, warnings = settings.mode, _inconsistencies(before, agreement, settings) if settings.mode == "need" else ()
     if warnings:
         mode = "paper"
 
@@ -222,13 +230,9 @@ def find_masks(
     return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), warnings)
 
 
-def _inconsistencies(before: Sequence[_Before], settings: MaskSettings) -> tuple[str, ...]:
+def _inconsistencies(before: Sequence[_Before], agreement: float, settings: MaskSettings) -> tuple[str, ...]:
     """Why what one view shows says nothing about the others, in words."""
     instead = "every pixel of the box's outline is filled (mode paper)"
-    cameras = [b.camera for b in before]
-    agreement = depth_agreement(
-        cameras, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance
-    )
     likeness = [b.likeness for b in before if np.isfinite(b.likeness)]
     found = []
     if agreement < settings.least_agreement:
@@ -487,7 +491,8 @@ def _continues_outside(
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
-    by other views past the table's edge, but it is not what was behind the object.
+    by other views past the table's edge, but it is not what was behind the object. Tables of rough scans leak beside
+    the object too, but little, for all that shows behind it.
     """
     z, void = depth, alpha < settings.void
     there = (z > 0) & (alpha >= settings.solid) | void
@@ -503,7 +508,9 @@ def _continues_outside(
     count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
     surface = surface.reshape(z.shape)
     outside = np.bincount(surface[there & ~touched], minlength=count)
-    return there & (outside[surface] >= settings.least_outside)
+    covered = np.bincount(surface[there & touched], minlength=count)
+    enough = np.maximum(settings.least_outside, settings.least_border * settings.around * np.sqrt(covered))
+    return there & (outside >= enough)[surface]
 
 
 def sees(
