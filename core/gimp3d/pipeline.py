@@ -498,10 +498,9 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
-def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
-    """ID → [H, W] bool: where a view may show the Gaussians."""
-    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
-    return dict(zip((v.camera.id for v in views), windows))
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, Window]:
+    """By ID, where Gaussians may be seen."""
+    return {v.camera.id: touched_window(gaussians, v.camera) for v in views}
 
 
 def _redrawn(
