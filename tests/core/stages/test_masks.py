@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
 import cv2
@@ -25,7 +25,7 @@ from gimp3d.raster.backend import CpuBackend
 from gimp3d.raster.cpu_drawing import CpuDrawing
 from gimp3d.stages import masks as stage
 from gimp3d.stages import selection
-from gimp3d.stages.masks import MaskSettings, find_masks, sees
+from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks, sees
 from gimp3d.stages.selection import Fate, SelectionSettings
 from gimp3d.threads import set_thread_count
 
@@ -347,3 +347,22 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
     assert area <= most * unseen
     assert touched >= 0.84 * either
     assert scale < 1 or masks.selection.count(Fate.KEPT_SURFACE) > 100
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 20), st.integers(1, 20))
+def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: int) -> None:
+    rng = np.random.default_rng(seed)
+    bits = rng.random((4, height, width)) < 0.3
+    before, alpha = rng.random((2, height, width), np.float32)
+    after = np.where(rng.random((height, width)) < 0.1, rng.random((height, width)), before).astype(np.float32)
+    view = ViewMasks(cameras()[0], *bits, before, after, alpha)
+    for name, expected in zip(("polygon", "silhouette", "occluder", "target"), bits):
+        found = getattr(view, name)
+        assert found.dtype == bool and (found == expected).all()
+    assert view.depth_after.dtype == np.float32 and (view.depth_after == after).all()
+    other = replace(view, target=~bits[3], depth_after=before)
+    assert (other.target == ~bits[3]).all() and (other.depth_after == before).all()
+    assert other.depth_before is before and other.alpha_after is alpha and (view.depth_after == after).all()
+    with pytest.raises(FrozenInstanceError):
+        view.target = bits[0]  # type: ignore[misc]
