@@ -7,6 +7,8 @@ took an eighth of its time for that. An array from here gives its memory back wh
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import threading
 
 import numpy as np
@@ -15,6 +17,7 @@ SMALLEST = 1 << 20  # bytes; less than that the allocator keeps by itself
 MOST_KEPT = 256 << 20  # bytes of unused memory
 LINE = 64  # bytes; arrays begin with a cache line, because vectors astride two cost twice
 
+_trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 _lock = threading.RLock()  # re-entrant: the garbage collector may give an array back while one is taken
 _free: dict[int, list[np.ndarray]] = {}  # by size, in the order in which they were last given back
 _kept = 0
@@ -72,8 +75,13 @@ def zeros(shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
 
 
 def release() -> None:
-    """Give unused memory back to the system."""
+    """Give unused memory back to the system, also what the C library keeps for itself.
+
+    glibc keeps a heap for each thread; what one thread leaves behind there, no other uses.
+    """
     global _kept
     with _lock:
         _free.clear()
         _kept = 0
+    if _trim is not None:
+        _trim(0)

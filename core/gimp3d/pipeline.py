@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeVar
 import cv2
 import numpy as np
 
+from . import buffers
 from .box import Region
 from .camera import Camera
 from .errors import IllPosed
@@ -248,6 +249,7 @@ def remove_object(
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
+        buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
@@ -273,11 +275,13 @@ def remove_object(
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
+        del painting
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
         near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
+    buffers.release()
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
