@@ -85,7 +85,7 @@ class MaskSettings:
 class ViewMasks:
     """What a view shows before and after the removal; all arrays [H, W] of the view.
 
-    Hundreds of these are held at once, so all but `depth_before` and `alpha_after` are kept small and made anew each
+    Hundreds of these are held at once, so all but `depth_before` and `alpha_before` are kept small and made anew each
     time they are read.
     """
 
@@ -95,6 +95,7 @@ class ViewMasks:
     occluder: np.ndarray  # bool, kept surfaces in front of the object, at its outline
     target: np.ndarray  # bool, T: the pixels to fill
     depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing, or nothing to be trusted
+    alpha_before: np.ndarray  # float32
     depth_after: np.ndarray  # float32 z without it
     alpha_after: np.ndarray  # float32
 
@@ -113,30 +114,29 @@ class _Bits:
         return np.unpackbits(bits, axis=1, count=width).view(bool)
 
 
-class _LikeBefore:
-    """A field of ViewMasks that is a depth map: only the rectangle is kept in which it is not `depth_before`."""
+class _Like:
+    """A field of ViewMasks that is mostly as another one: only the rectangle is kept in which it is not."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, base: str) -> None:
+        self.name, self.base = name, base
 
-    def __set__(self, view: ViewMasks, depth: np.ndarray) -> None:
-        other = depth != view.depth_before
+    def __set__(self, view: ViewMasks, picture: np.ndarray) -> None:
+        other = picture != getattr(view, self.base)
         rows, cols = np.flatnonzero(other.any(1)), np.flatnonzero(other.any(0))
         window = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] if len(rows) else np.s_[:0, :0]
-        view.__dict__[self.name] = window, depth[window].copy()
+        view.__dict__[self.name] = window, picture[window].copy()
 
     def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
         window, values = view.__dict__[self.name]
-        depth = view.depth_before.copy()
-        depth[window] = values
-        return depth
+        picture = getattr(view, self.base).copy()
+        picture[window] = values
+        return picture
 
 
-for _name, _kept in (
-    *((n, _Bits) for n in ("polygon", "silhouette", "occluder", "target")),
-    ("depth_after", _LikeBefore),
-):
-    setattr(ViewMasks, _name, _kept(_name))
+for _name in ("polygon", "silhouette", "occluder", "target"):
+    setattr(ViewMasks, _name, _Bits(_name))
+for _what in ("depth", "alpha"):
+    setattr(ViewMasks, f"{_what}_after", _Like(f"{_what}_after", f"{_what}_before"))
 
 
 @dataclass(frozen=True)
@@ -446,7 +446,7 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
 def _view_masks(
     before: _Before, after: _After, needed: np.ndarray, consistent: bool, settings: MaskSettings
 ) -> ViewMasks:
-    window, depth, alpha = after.window, before.depth, before.alpha
+    window, depth = after.window, before.depth
     silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
     silhouette[window] = after.weight > settings.changed
     if consistent:  # else depths say nothing
@@ -455,10 +455,18 @@ def _view_masks(
     target = needed & ~occluder & (silhouette | ~beside)  # beside what is in front T must not outgrow the object
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
-    depth_after, alpha_after = before.depth.copy(), alpha
-    depth_after[window], alpha_after[window] = after.depth, after.alpha  # of alpha, what was before is not needed
+    depth_after, alpha_after = before.depth.copy(), before.alpha.copy()
+    depth_after[window], alpha_after[window] = after.depth, after.alpha
     return ViewMasks(
-        before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, depth_after, alpha_after
+        before.camera,
+        _polygon_pixels(before),
+        silhouette,
+        occluder,
+        target,
+        depth,
+        before.alpha,
+        depth_after,
+        alpha_after,
     )
 
 

@@ -65,7 +65,7 @@ def view_of(camera, height):
     alpha = (after > 0).astype(np.float32)
     none = np.zeros_like(silhouette)
     target = silhouette & (after > 0)
-    return ViewMasks(camera, silhouette, silhouette, none, target, np.where(hit, ball, after), after, alpha)
+    return ViewMasks(camera, silhouette, silhouette, none, target, np.where(hit, ball, after), alpha, after, alpha)
 
 
 @pytest.fixture(scope="module", params=[floor, mound], ids=["floor", "mound"])
@@ -186,11 +186,11 @@ def test_what_shows_from_under_a_table_is_no_evidence():
     ball = sphere_depth(CAMERAS[0])
     before = np.where((ball > 0) & (ball < whole), ball, whole)
     alpha, none = np.ones_like(whole), np.zeros_like(gap)
-    view = ViewMasks(CAMERAS[0], gap, gap, none, gap, before, after, alpha)
+    view = ViewMasks(CAMERAS[0], gap, gap, none, gap, before, alpha, after, alpha)
     others = []
     for camera in low:
         _, ground, _ = table(camera)
-        others.append(ViewMasks(camera, none, none, none, none, ground, ground, alpha))
+        others.append(ViewMasks(camera, none, none, none, none, ground, alpha, ground, alpha))
     known = ~gap & (after > 0)
     assert (gather_depth_evidence(view, others).weight > 0).sum() > 0.1 * gap.sum()  # the trap is there
     found = complete_depth(view, [view, *others], 1 / np.maximum(after, 1e-3), known)

@@ -354,15 +354,17 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
 def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: int) -> None:
     rng = np.random.default_rng(seed)
     bits = rng.random((4, height, width)) < 0.3
-    before, alpha = rng.random((2, height, width), np.float32)
-    after = np.where(rng.random((height, width)) < 0.1, rng.random((height, width)), before).astype(np.float32)
-    view = ViewMasks(cameras()[0], *bits, before, after, alpha)
+    before = rng.random((2, height, width), np.float32)
+    after = np.where(rng.random((2, height, width)) < 0.1, rng.random((2, height, width)), before).astype(np.float32)
+    view = ViewMasks(cameras()[0], *bits, *before, *after)
     for name, expected in zip(("polygon", "silhouette", "occluder", "target"), bits):
         found = getattr(view, name)
         assert found.dtype == bool and (found == expected).all()
-    assert view.depth_after.dtype == np.float32 and (view.depth_after == after).all()
-    other = replace(view, target=~bits[3], depth_after=before)
-    assert (other.target == ~bits[3]).all() and (other.depth_after == before).all()
-    assert other.depth_before is before and other.alpha_after is alpha and (view.depth_after == after).all()
+    assert view.depth_after.dtype == view.alpha_after.dtype == np.float32
+    assert (view.depth_after == after[0]).all() and (view.alpha_after == after[1]).all()
+    other = replace(view, target=~bits[3], depth_after=before[0])
+    assert (other.target == ~bits[3]).all() and (other.depth_after == before[0]).all()
+    assert other.depth_before is view.depth_before and other.alpha_before is view.alpha_before
+    assert (view.depth_after == after[0]).all()
     with pytest.raises(FrozenInstanceError):
         view.target = bits[0]  # type: ignore[misc]
