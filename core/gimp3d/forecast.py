@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
 ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
-PER_STEP = 0.025  # s
+PER_STEP = 0.005  # s
 PER_MEGAPIXEL = {"read": 0.3, "masks": 0.6, "reference": 0.2, "propagate": 0.3}  # s for each million pixels of views
 PER_STAGE = {"depth": 0.25, "appearance": 0.3, "mapping": 0.1, "seed": 0.05}  # s
 PER_MILLION_VIEWED = 0.5  # s of masks for each million Gaussians in each view
 BASE_MB, MB_PER_MEGAPIXEL, MB_PER_MILLION = 350.0, 40.0, 1000.0
-REFINE_MB = 350.0  # PyTorch
+REFINE_MB = 50.0  # the views, made ready
 
 
 @dataclass(frozen=True)

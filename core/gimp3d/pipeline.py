@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
 
+from . import buffers
 from .box import Region
 from .camera import Camera
 from .errors import IllPosed
@@ -18,7 +19,7 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, drawing, render, surface_depth, touched_window
+from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
@@ -38,12 +39,14 @@ from .stages.propagate import (
 )
 from .stages.reference import (
     EvidenceSettings,
+    NeededSurface,
     ReferenceChoice,
     ReferenceSettings,
     ViewScore,
     choose_reference,
     disparity_of,
     gather_evidence,
+    needed_surface,
     rim,
 )
 from .stages.refine import (
@@ -248,8 +251,10 @@ def remove_object(
     levelled = {name: e.image for name, e in exposures.items()}
     filled, added = kept, None
     open_views = masks.views
+    surface = cache(partial(needed_surface, masks.views, settings.masks.solid, settings.reference))
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
+        buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
@@ -259,6 +264,7 @@ def remove_object(
                 "" if first else f" {round_ + 1}",
                 filled,
                 open_views,
+                surface,
                 levelled,
                 painted,
                 settings,
@@ -275,11 +281,13 @@ def remove_object(
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
+        del painting
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
         near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
+    buffers.release()
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
@@ -319,6 +327,7 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
+    surface: Callable[[], NeededSurface],  # what was needed at first
     photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
@@ -328,7 +337,7 @@ def _fill_from_one_view(
     """Complete one reference, carry it into every view, and make its Gaussians."""
     solid = settings.masks.solid
     choice: ReferenceChoice = run(
-        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference)
+        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference, surface())
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
@@ -500,17 +509,16 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
-def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
-    """ID → [H, W] bool: where a view may show the Gaussians."""
-    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
-    return dict(zip((v.camera.id for v in views), windows))
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, Window]:
+    """By ID, where Gaussians may be seen."""
+    return {v.camera.id: touched_window(gaussians, v.camera) for v in views}
 
 
 def _redrawn(
     painted: dict[str, np.ndarray],
     filled: Gaussians,
     views: Sequence[ViewMasks],
-    touched: dict[str, np.ndarray],  # ID → [H, W] bool, where the last new Gaussians may be
+    touched: dict[str, Window],  # by ID, where the last new Gaussians may be
 ) -> dict[str, np.ndarray]:
     """The painted views, with the filled scene where the removal left a gap that was never to be filled.
 
@@ -519,7 +527,12 @@ def _redrawn(
 
     def redraw(view: ViewMasks) -> np.ndarray:
         picture = painted[view.camera.id]
-        gap = view.silhouette & ~view.target & (view.alpha_after < 0.99) & touched[view.camera.id]
+        gap = (
+            view.silhouette
+            & ~view.target
+            & (view.alpha_after < 0.99)
+            & window_mask(touched[view.camera.id], view.camera)
+        )
         if not gap.any():
             return picture
         return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
@@ -532,13 +545,14 @@ def _all_still_open(
     filled: Gaussians,
     added: int,
     rules: dict[str, np.ndarray],
-    touched: dict[str, np.ndarray],
+    touched: dict[str, Window],
     masks: MaskSettings,
 ) -> tuple[ViewMasks, ...]:
     def left(view: ViewMasks) -> ViewMasks:
         if not view.target.any():
             return view
-        return _still_open(view, filled, added, rules[view.camera.id], touched[view.camera.id], masks)
+        name = view.camera.id
+        return _still_open(view, filled, added, rules[name], window_mask(touched[name], view.camera), masks)
 
     return tuple(parallel_map(left, views))
 
