@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import cv2
@@ -39,14 +39,12 @@ from .stages.propagate import (
 )
 from .stages.reference import (
     EvidenceSettings,
-    NeededSurface,
     ReferenceChoice,
     ReferenceSettings,
     ViewScore,
     choose_reference,
     disparity_of,
     gather_evidence,
-    needed_surface,
     rim,
 )
 from .stages.refine import (
@@ -251,7 +249,6 @@ def remove_object(
     levelled = {name: e.image for name, e in exposures.items()}
     filled, added = kept, None
     open_views = masks.views
-    surface = cache(partial(needed_surface, masks.views, settings.masks.solid, settings.reference))
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
         buffers.release()  # a stage's leavings are of little use to the next
@@ -264,7 +261,6 @@ def remove_object(
                 "" if first else f" {round_ + 1}",
                 filled,
                 open_views,
-                surface,
                 levelled,
                 painted,
                 settings,
@@ -327,7 +323,6 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
-    surface: Callable[[], NeededSurface],  # what was needed at first
     photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
@@ -335,9 +330,9 @@ def _fill_from_one_view(
     given: np.ndarray | None,
 ) -> tuple[Gaussians, Propagation]:
     """Complete one reference, carry it into every view, and make its Gaussians."""
-    solid = settings.masks.solid
+    solid, tried = settings.masks.solid, {c.camera_id for c in run.references}
     choice: ReferenceChoice = run(
-        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference, surface())
+        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference, tried)
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)

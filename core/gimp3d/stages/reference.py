@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +17,6 @@ from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks, sees
 
 PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000))  # where the hidden surface is, about
-LEAST_SAMPLES = 100  # of a surface given, that must be open still
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,7 @@ def choose_reference(
     wanted: str | None = None,
     solid: float = 0.9,
     settings: ReferenceSettings = ReferenceSettings(),
-    surface: NeededSurface | None = None,  # of these views, or of them when more was open; None: it is looked for
+    tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
@@ -175,15 +174,10 @@ def choose_reference(
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    seen: list[tuple[np.ndarray, np.ndarray] | None] = []
-    if surface is not None:
-        seen = _seen_in_all(views, surface, settings)
-    open_ = np.any([s[0] > 0 for s in seen if s is not None], axis=0)
-    if np.count_nonzero(open_) >= LEAST_SAMPLES:
-        seen = [None if s is None else (s[0][open_], s[1][open_]) for s in seen]
-    else:
-        seen = _seen_in_all(views, needed_surface(views, solid, settings), settings)
-    candidates = [(v, *s) for v, s in zip(views, seen) if s is not None and s[0].any() and _has_rim(v, solid)]
+    surface = needed_surface(views, solid, settings)
+    seen = parallel_map(lambda v: _seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None, views)
+    untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
+    candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and _has_rim(v, solid)]
     if not candidates:
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
     best_worth = np.max([cosine * density for _, cosine, density in candidates], axis=0)
@@ -208,13 +202,6 @@ def choose_reference(
     if len(plan) > 1:
         reason += "; then " + ", ".join(f"{name} to {share:.0%}" for name, share in plan[1:3])
     return ReferenceChoice(chosen.camera_id, tuple(scores), plan, chosen.score / scores[0].score, reason)
-
-
-def _seen_in_all(
-    views: Sequence[ViewMasks], surface: NeededSurface, settings: ReferenceSettings
-) -> list[tuple[np.ndarray, np.ndarray] | None]:
-    """`_seen` of every view that is large enough to be the reference."""
-    return parallel_map(lambda v: _seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None, views)
 
 
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
