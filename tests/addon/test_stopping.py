@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from gimp3d_addon import jobs, splats
 from gimp3d_addon.operators.base import RunsChild, current_splat
 from gimp3d_addon.operators.reference import RunsReference
 from gimp3d_addon.operators.remove import SOURCE, GIMP3D_OT_remove_object, RunsRemoval
-from gimp3d_addon.worker import Worker
+from gimp3d_addon.worker import GIVE_WAY, Worker
 
 
 class Window:
@@ -89,6 +90,15 @@ def test_a_run_in_the_window_never_blocks_and_ends_with_the_result(splat: bpy.ty
     assert any("masks" in s and "left" in s for s in told) and window.status[-1] is None
     assert RunsChild.running is None
     assert bpy.context.scene.gimp3d.hole.endswith("views")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such number")
+def test_a_child_gives_way_to_blenders_window() -> None:
+    """Else drawing waits for a core: up to 0.5 s with software OpenGL."""
+    worker = Worker([], command=[sys.executable, "-c", "input()"])
+    nicer = os.getpriority(os.PRIO_PROCESS, worker._process.pid) - os.getpriority(os.PRIO_PROCESS, 0)
+    worker.cancel()
+    assert nicer == GIVE_WAY
 
 
 def test_escape_leaves_the_scene_as_it_was_within_a_second(splat: bpy.types.Object) -> None:

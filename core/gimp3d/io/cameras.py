@@ -21,6 +21,7 @@ from ..gaussians import quats_to_matrices
 from ..job import write_atomically
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
+EXACT = "world_to_camera"  # our own key of a frame; counts only where transform_matrix says the same
 REFUSED = {
     "fisheye": {
         "OPENCV_FISHEYE",
@@ -91,7 +92,10 @@ def read_cameras(
 
 
 def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
-    """Write a nerfstudio transforms.json with exact intrinsics per frame. Written atomically."""
+    """Write a nerfstudio transforms.json with exact intrinsics per frame. Written atomically.
+
+    Beside nerfstudio's pose it holds the view matrix, as inverting twice does not give every last bit back.
+    """
     frames = []
     for c in cameras:
         d = c.distortion or Distortion()
@@ -111,6 +115,7 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
                 "p2": d.p2,
                 "k3": d.k3,
                 "transform_matrix": (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist(),
+                EXACT: c.viewmat.tolist(),
             }
         )
     document = {"camera_model": "OPENCV", "frames": frames}
@@ -221,13 +226,23 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
         extra = [k for k in ("k4", "k5", "k6") if both.get(k)]
         if extra:
             raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        viewmat = np.linalg.inv(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV)
+        viewmat = _exactly(np.linalg.inv(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV), frame.get(EXACT))
         distortion = _distortion([both.get(c, 0.0) for c in ("k1", "k2", "p1", "p2", "k3")], where)
         split = both.get("split", "train")
         if split not in ("train", "test"):
             raise BadInput(f"{where}: split must be train or test, got {split!r}")
         cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, split, photo))
     return tuple(cameras)
+
+
+def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
+    """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
+    try:
+        exact = np.array(told, dtype=np.float64)
+    except (TypeError, ValueError):
+        return viewmat
+    same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
+    return exact if same else viewmat
 
 
 def _transforms_intrinsics(both: dict[str, Any], photo: Path, where: str) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
