@@ -16,21 +16,28 @@ from ..properties import GIMP3D_preferences, preferences
 from ..worker import Worker, child_command, own_python
 from .base import RunsChild, python_of
 
-LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "zstandard")
+LIBRARIES = (  # as in pyproject.toml, which is not in the zip
+    "numpy>=1.26,<3",
+    "scipy>=1.11,<2",
+    "numba>=0.61,<1",
+    "opencv-contrib-python-headless>=4.8,<6",
+    "zstandard>=0.22,<1",
+)
+TORCH = "torch>=2.4,<3"
 SIZES = ("about 170 MB to download, 650 MB on disk", "about 400 MB to download, 1.5 GB on disk")
 TORCH_INDEX = "https://download.pytorch.org/whl/cpu"  # PyPI's own brings 2 GB of CUDA along on Linux
 MAKE = """
 import json, subprocess, sys, venv
-folder, python, torch_index, *libraries = sys.argv[1:]
+folder, python, torch, torch_index, *libraries = sys.argv[1:]
 say = lambda done, what: print(json.dumps({"stage": what, "done": done, "total": 3}), flush=True)
 say(0, "making the environment")
 venv.create(folder, with_pip=True, clear=True)
 pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
 say(1, "installing the libraries")
 code = subprocess.run([*pip, *libraries]).returncode
-if torch_index and not code:
+if torch and not code:
     say(2, "installing PyTorch")
-    code = subprocess.run([*pip, "torch", "--index-url", torch_index]).returncode
+    code = subprocess.run([*pip, torch, "--index-url", torch_index]).returncode
 sys.exit(code)
 """
 CHECK = """
@@ -77,26 +84,23 @@ class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
         cls.poll_message_set("Enable the extension first")
         return preferences(context) is not None and RunsChild.running is None
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=420, confirm_text="Download and Install")
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.label(text=f"Downloads {', '.join(LIBRARIES)}")
+        self.layout.label(text=f"Downloads {', '.join(library.split('>')[0] for library in LIBRARIES)}")
         self.layout.label(text=f"from PyPI: {SIZES[self.torch]}.")
         self.layout.label(text=str(environment_folder()))
         self.layout.prop(self, "torch")
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """After the dialogue's OK: beside Blender in the window, waiting in scripts."""
-        return RunsChild.execute(self, context) if bpy.app.background else RunsChild.invoke(self, context, None)
 
     def start(self, context: bpy.types.Context) -> Worker:
         if not bpy.app.online_access:
             raise BadInput("Blender is set to stay offline; allow it in Preferences › System › Network")
         folder = environment_folder()
         self._python = environment_python(folder)
-        index = TORCH_INDEX if self.torch else ""
-        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), index, *LIBRARIES])
+        torch = TORCH if self.torch else ""
+        made = [str(folder), str(self._python), torch, TORCH_INDEX, *LIBRARIES]
+        return Worker([], command=[own_python(), "-c", MAKE, *made])
 
     def collect(self, context: bpy.types.Context) -> None:
         self.worker.result()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,6 +76,12 @@ def test_a_download_that_fails_is_said_and_changes_nothing(
     with pytest.raises(RuntimeError, match="gimp3d: error: "):
         bpy.ops.gimp3d.make_environment(torch=False)
     assert preferences.python == ""
+
+
+def test_the_button_installs_what_the_library_declares() -> None:
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    assert list(environment.LIBRARIES) == project["dependencies"]
+    assert project["optional-dependencies"]["torch"] == [environment.TORCH]
 
 
 def test_the_dialogue_names_the_sizes() -> None:

@@ -17,7 +17,7 @@ import pytest
 from gimp3d.io.ply import read_ply
 from gimp3d_addon import jobs, splats
 from gimp3d_addon.operators.base import RunsChild, current_splat
-from gimp3d_addon.operators.reference import RunsReference
+from gimp3d_addon.operators.reference import GIMP3D_OT_export_reference, RunsReference
 from gimp3d_addon.operators.remove import SOURCE, GIMP3D_OT_remove_object, RunsRemoval
 from gimp3d_addon.worker import GIVE_WAY, Worker
 
@@ -54,8 +54,8 @@ class Window:
         """The same for any operator that runs a child."""
         pressed = operator()
         pressed.report = lambda kind, text: self.reports.append((kind, text))
-        pressed.worker = pressed.start(self)
-        RunsChild.running, pressed._timer = pressed, "timer"
+        pressed.in_window = True  # what `invoke` sets; a file browser then calls `execute`
+        assert pressed.execute(self) == {"RUNNING_MODAL"}
         longest = 0.0
         while True:
             sent = event if until(pressed) else "TIMER"
@@ -188,6 +188,17 @@ def test_a_chain_of_children_runs_in_the_window(splat: bpy.types.Object) -> None
     window = Window()
     assert window.press(Pressed) == {"FINISHED"} and delivered == [True]
     assert window.longest_tick < 0.5 and RunsChild.running is None
+
+
+def test_the_reference_is_written_beside_a_free_window(splat: bpy.types.Object, tmp_path: Path) -> None:
+    class Pressed(RunsReference):
+        bl_label = GIMP3D_OT_export_reference.bl_label
+        filepath = str(tmp_path / "ref.png")
+        deliver = GIMP3D_OT_export_reference.deliver
+
+    window = Window()
+    assert window.press(Pressed) == {"FINISHED"} and window.longest_tick < 0.5
+    assert (tmp_path / "ref.png").is_file() and (tmp_path / "ref.mask.png").is_file()
 
 
 def test_opening_another_file_ends_the_run(splat: bpy.types.Object) -> None:

@@ -151,13 +151,31 @@ def rigid(
         m = np.vstack([m, [0, 0, 0, 1]])
     if m.shape != (4, 4) or not np.isfinite(m).all():
         raise BadInput(f"{where}: the pose is not a finite 4×4 matrix")
-    u, s, vt = np.linalg.svd(m[:3, :3])
+    s = np.linalg.svd(m[:3, :3], compute_uv=False)
     if s[2] < 1e-9 or s[0] / s[2] > 1.001:
         raise BadInput(f"{where}: the pose is sheared or flat; only rotation, translation and uniform scale are poses")
-    rotation = u @ vt
-    if np.linalg.det(rotation) < 0:
+    if np.linalg.det(m[:3, :3]) < 0:
         raise BadInput(f"{where}: the pose mirrors the scene")
-    return np.block([[rotation, m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    return np.block([[_nearest_rotation(m[:3, :3]), m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def _nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """The rotation in a rotation with uniform scale [3, 3]: Newton's iteration X ← (X + X⁻ᵀ) / 2 (Higham 1986).
+
+    In products and sums of single numbers, as LAPACK's last bits differ between NumPys and Blender has its own.
+    """
+    x = linear / np.sqrt((linear**2).sum() / 3)
+    for _ in range(6):  # quadratic from 1e-3 on
+        cofactors = np.cross(x[[1, 2, 0]], x[[2, 0, 1]])
+        x = (x + cofactors / (x[0] * cofactors[0]).sum()) / 2
+    return x
+
+
+def _inverted(pose: np.ndarray) -> np.ndarray:
+    """A rigid pose [4, 4] the other way round, to the same bits with every NumPy."""
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -(pose[:3, :3] * pose[:3, 3:]).sum(0)
+    return inverse
 
 
 def make_camera(
@@ -226,7 +244,7 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
         extra = [k for k in ("k4", "k5", "k6") if both.get(k)]
         if extra:
             raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        viewmat = _exactly(np.linalg.inv(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV), frame.get(EXACT))
+        viewmat = _exactly(_inverted(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV), frame.get(EXACT))
         distortion = _distortion([both.get(c, 0.0) for c in ("k1", "k2", "p1", "p2", "k3")], where)
         split = both.get("split", "train")
         if split not in ("train", "test"):
@@ -299,7 +317,7 @@ def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[C
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers") from None
         name = camera_id(entry["img_name"], where)
         size = (entry["width"], entry["height"])
-        viewmat = np.linalg.inv(rigid(pose, where))
+        viewmat = _inverted(rigid(pose, where))
         try:
             centre = (float(size[0]) / 2, float(size[1]) / 2)
         except (TypeError, ValueError):
