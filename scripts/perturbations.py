@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
-from gimp3d.raster import RasterSettings, Rendering, use_backend
+from gimp3d.raster import Drawing, RasterSettings, Rendering, use_backend
 from gimp3d.raster.backend import Backend, current_backend
 
 GRAIN = 3.0  # px, σ of the blur that makes depth errors as coarse as splats are
@@ -58,23 +58,40 @@ class NoisyDepths:
         self.backend, self.relative, self.seed = backend, relative, seed
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering:
-        drawn = self.backend.render(gaussians, camera, settings, passes)
+        drawn = self.backend.render(gaussians, camera, settings, passes, pixels)
         depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
         return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
 
-    def surface_depth(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
-    ) -> tuple[np.ndarray, np.ndarray]:
-        depth, alpha = self.backend.surface_depth(gaussians, camera, settings)
-        return depth * self._factor(camera), alpha
+    def drawing(self, gaussians: Gaussians, camera: Camera, *options: Any) -> NoisyDrawing:
+        return NoisyDrawing(self.backend.drawing(gaussians, camera, *options), self._factor(camera))
 
     def _factor(self, camera: Camera) -> np.ndarray:
         return 1 + self.relative * depth_errors(camera.id, camera.height, camera.width, self.seed)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.backend, name)
+
+
+@dataclass
+class NoisyDrawing:
+    """A `Drawing` whose surface is off by a factor [H, W]."""
+
+    drawing: Drawing
+    factor: np.ndarray
+
+    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        depth, alpha = self.drawing.surface_depth(gone)
+        return depth * self.factor, alpha
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.drawing, name)
 
 
 @lru_cache(maxsize=256)

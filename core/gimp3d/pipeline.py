@@ -18,13 +18,14 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, footprint, render, surface_depth
+from .raster import RasterSettings, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
-from .stages.exposure import level_exposure
+from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
+from .stages.outline import window_mask
 from .stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -32,6 +33,7 @@ from .stages.propagate import (
     Reference,
     Rule,
     ViewToPaint,
+    near_hole,
     propagate,
 )
 from .stages.reference import (
@@ -44,7 +46,12 @@ from .stages.reference import (
     gather_evidence,
     rim,
 )
-from .stages.refine import Refinement, RefineSettings, observed, refine_gaussians, torch_is_there
+from .stages.refine import (
+    Refinement,
+    RefineSettings,
+    observed,
+    refine_gaussians,
+)
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .threads import parallel_map
@@ -224,13 +231,19 @@ def remove_object(
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         return _finish(run, keep, None, masks, {}, [why])
     kept = scene.take(keep)
-    drawn = {v.camera.id: render_bytes(kept, v.camera) for v in masks.views}
-    exposures = {v.camera.id: level_exposure(v, photos[v.camera.id], drawn[v.camera.id]) for v in masks.views}
+
+    def emptied(v: ViewMasks) -> tuple[Exposure, np.ndarray]:
+        """A view's photo at the splats' exposure, and with the emptied scene in the object's place."""
+        silhouette, ring = v.silhouette, exposure_ring(v)
+        drawn = render_bytes(kept, v.camera, pixels=silhouette | ring)
+        exposure = level_exposure(ring, photos[v.camera.id], drawn)
+        return exposure, np.where(silhouette[..., None], drawn, exposure.image)
+
+    names = [v.camera.id for v in masks.views]
+    found = parallel_map(emptied, masks.views)
+    exposures, painted = {n: e for n, (e, _) in zip(names, found)}, {n: p for n, (_, p) in zip(names, found)}
+    del found
     levelled = {name: e.image for name, e in exposures.items()}
-    painted = {
-        v.camera.id: np.where(v.silhouette[..., None], drawn[v.camera.id], levelled[v.camera.id]) for v in masks.views
-    }
-    del drawn
     filled, added = kept, None
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
@@ -262,17 +275,20 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
-        painted = _redrawn(painted, filled, masks.views, open_views)
-        open_views = _all_still_open(open_views, filled, len(added), rules, settings.masks)
+        near_new = _where_drawn(new, masks.views)
+        painted = _redrawn(painted, filled, masks.views, near_new)
+        open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
-    painted = {
-        name: exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
-        for name, v in ((v.camera.id, v) for v in masks.views)
-    }
+
+    def finish(v: ViewMasks) -> None:
+        name = v.camera.id
+        painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
+
+    parallel_map(finish, masks.views)
     return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
 
 
@@ -285,11 +301,8 @@ def _refined(
     told: dict[str, np.ndarray],
     settings: RemovalSettings,
 ) -> Gaussians | None:
-    """The new Gaussians, optimised where the settings ask for it and torch is there."""
+    """The new Gaussians, optimised where the settings ask for it."""
     if added is None or not settings.refine.steps:
-        return added
-    if not torch_is_there():
-        run.warnings.append("torch is not installed: the new Gaussians are not refined, as in the preset draft")
         return added
     views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
     refinement: Refinement = run(
@@ -333,10 +346,12 @@ def _fill_from_one_view(
 
     def to_paint(v: ViewMasks) -> ViewToPaint:
         name = v.camera.id
-        depth_new = surface_depth(with_seeds, v.camera)[0]
+        window = near_hole(v.target, settings.propagate)
+        depth_new = np.zeros_like(v.depth_before)
+        if v.target.any():
+            depth_new = surface_depth(with_seeds, v.camera, pixels=window_mask(window, v.camera))[0]
         return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
-    loaders = [partial(to_paint, v) for v in open_views]
     source = ~view.target & ~view.silhouette & (depth > 0)
     field_: MappingField = run(
         f"mapping{suffix}",
@@ -358,7 +373,8 @@ def _fill_from_one_view(
     )
     reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
     painting: Propagation = run(
-        f"propagate{suffix}", lambda: propagate(reference, loaders, settings.propagate, run.progress)
+        f"propagate{suffix}",
+        lambda: propagate(reference, [partial(to_paint, v) for v in open_views], settings.propagate, run.progress),
     )
     painting = _with_reference(painting, view, appearance)
     name = view.camera.id
@@ -377,13 +393,14 @@ def _fill_from_one_view(
             for p in _spread(painting.views)
         ),
     ]
+    cameras = [v.camera for v in open_views]
     new: Gaussians = run(
         f"seed{suffix}",
         lambda: settle_gaussians(
             filled,
-            colour_gaussians(seeds, view.camera, loaders, painting.views, filled.sh_degree, settings.seed),
+            colour_gaussians(seeds, view.camera, cameras, painting.views, filled.sh_degree, settings.seed),
             view.camera,
-            loaders,
+            cameras,
             painting.views,
             settings.seed,
         ),
@@ -394,9 +411,16 @@ def _fill_from_one_view(
 
 def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearance) -> Propagation:
     """The reference itself shows its own completed picture, not a mapped one."""
-    rules = np.where(view.target, Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    own = PaintedView(view.camera.id, 0, 0, appearance.image, appearance.image, rules)
-    return replace(painting, views=tuple(own if p.camera_id == view.camera.id else p for p in painting.views))
+
+    def shown(paint: PaintedView) -> PaintedView:
+        if paint.camera_id != view.camera.id:
+            return paint
+        h, w = paint.rules.shape
+        part = slice(paint.top, paint.top + h), slice(paint.left, paint.left + w)
+        rules = np.where(view.target[part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+        return replace(paint, image=appearance.image[part], raw=appearance.image[part], rules=rules)
+
+    return replace(painting, views=tuple(shown(p) for p in painting.views))
 
 
 def _complete_depth(
@@ -464,7 +488,7 @@ def _appearance(
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
-        sources = [(v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views]
+        sources = ((v.camera, photos[v.camera.id], np.where(v.silhouette, 0, v.depth_before)) for v in open_views)
         evidence = gather_evidence(view.camera, depth, view.target, sources, settings.evidence)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
@@ -474,29 +498,57 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
+    """ID → [H, W] bool: where a view may show the Gaussians."""
+    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
+    return dict(zip((v.camera.id for v in views), windows))
+
+
 def _redrawn(
-    painted: dict[str, np.ndarray], filled: Gaussians, first: Sequence[ViewMasks], open_views: Sequence[ViewMasks]
+    painted: dict[str, np.ndarray],
+    filled: Gaussians,
+    views: Sequence[ViewMasks],
+    touched: dict[str, np.ndarray],  # ID → [H, W] bool, where the last new Gaussians may be
 ) -> dict[str, np.ndarray]:
     """The painted views, with the filled scene where the removal left a gap that was never to be filled.
 
     Beside what is in front, its soft edge is no target, but the emptied scene shows through it.
     """
 
-    def redraw(before: ViewMasks, now: ViewMasks) -> np.ndarray:
-        picture = painted[now.camera.id]
-        gap = before.silhouette & ~before.target & (before.alpha_after < 0.99)
-        return np.where(gap[..., None], render_bytes(filled, now.camera), picture) if gap.any() else picture
+    def redraw(view: ViewMasks) -> np.ndarray:
+        picture = painted[view.camera.id]
+        gap = view.silhouette & ~view.target & (view.alpha_after < 0.99) & touched[view.camera.id]
+        if not gap.any():
+            return picture
+        return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
 
-    return dict(zip(painted, parallel_map(lambda pair: redraw(*pair), zip(first, open_views))))
+    return dict(zip((v.camera.id for v in views), parallel_map(redraw, views)))
 
 
 def _all_still_open(
-    views: Sequence[ViewMasks], filled: Gaussians, added: int, rules: dict[str, np.ndarray], masks: MaskSettings
+    views: Sequence[ViewMasks],
+    filled: Gaussians,
+    added: int,
+    rules: dict[str, np.ndarray],
+    touched: dict[str, np.ndarray],
+    masks: MaskSettings,
 ) -> tuple[ViewMasks, ...]:
-    return tuple(parallel_map(lambda v: _still_open(v, filled, added, rules[v.camera.id], masks), views))
+    def left(view: ViewMasks) -> ViewMasks:
+        if not view.target.any():
+            return view
+        return _still_open(view, filled, added, rules[view.camera.id], touched[view.camera.id], masks)
+
+    return tuple(parallel_map(left, views))
 
 
-def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray, masks: MaskSettings) -> ViewMasks:
+def _still_open(
+    view: ViewMasks,
+    filled: Gaussians,
+    added: int,
+    rules: np.ndarray,
+    touched: np.ndarray,  # [H, W] bool, where the last new Gaussians may be: elsewhere the view is as it was
+    masks: MaskSettings,
+) -> ViewMasks:
     """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
 
     A pixel that a splat's edge covers but that got no colour stays open, or the next fill would continue its old one.
@@ -505,11 +557,14 @@ def _still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarra
     """
     new = np.zeros(len(filled), bool)
     new[-added:] = True
-    covered = footprint(filled, view.camera, new, RasterSettings()) > 0.5
-    depth, alpha = surface_depth(filled, view.camera)
+    side = 2 * masks.margin + 1
+    near = touched | (cv2.dilate(view.target.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+    scene = drawing(filled, view.camera, with_colour=False, pixels=near)
+    before = view.depth_after, view.alpha_after
+    depth, alpha = (np.where(touched, d, b) for d, b in zip(scene.surface_depth(), before))
+    covered = scene.footprint(new) > 0.5
     coloured = (rules != Rule.UNREACHED) | (view.alpha_after > masks.solid)
     target = view.target & (~covered | (rules == Rule.UNREACHED))
-    side = 2 * masks.margin + 1
     farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))
     nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
     at_edge = nearest < (1 - masks.layer_step) * depth
@@ -528,10 +583,13 @@ def _open_pixels(open_views: Sequence[ViewMasks]) -> int:
 
 
 def render_bytes(
-    gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] = (0, 0, 0)
+    gaussians: Gaussians,
+    camera: Camera,
+    background: tuple[float, float, float] = (0, 0, 0),
+    pixels: np.ndarray | None = None,  # [H, W] bool, those that are wanted
 ) -> np.ndarray:
     """The scene as 8-bit RGB, [H, W, 3]."""
-    rgb = render(gaussians, camera, RasterSettings(background=background), frozenset({"rgb"})).rgb
+    rgb = render(gaussians, camera, RasterSettings(background=background), frozenset({"rgb"}), pixels).rgb
     return np.clip(np.rint(rgb * 255), 0, 255).astype(np.uint8)
 
 

@@ -12,8 +12,9 @@ from scenes import discs as discs_on
 
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import _redrawn, _still_open, render_bytes
-from gimp3d.raster import footprint, surface_depth
+from gimp3d.raster import footprint, surface_depth, touched_window
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
+from gimp3d.stages.outline import window_mask
 from gimp3d.stages.propagate import Rule
 
 SETTINGS = MaskSettings()
@@ -55,7 +56,9 @@ def patch(least_x: float = -BLOCK / 2) -> Gaussians:
 
 
 def opened(new: Gaussians, rules: np.ndarray) -> ViewMasks:
-    return _still_open(view(), floor(with_hole=True).extended(new), len(new), rules, SETTINGS)
+    camera = view().camera
+    touched = window_mask(touched_window(new, camera), camera)
+    return _still_open(view(), floor(with_hole=True).extended(new), len(new), rules, touched, SETTINGS)
 
 
 def told() -> np.ndarray:
@@ -116,15 +119,17 @@ def test_gaps_that_were_no_target_are_drawn_from_the_filled_scene() -> None:
         target=view().target & ~gap,
         alpha_after=np.where(gap | view().target, np.float32(0.5), np.float32(1.0)),
     )
-    filled = floor(with_hole=False)
-    done = _redrawn({camera.id: grey}, filled, [one], [view()])[camera.id]
+    filled, everywhere = floor(with_hole=False), np.ones_like(gap)
+    done = _redrawn({camera.id: grey}, filled, [one], {camera.id: everywhere})[camera.id]
     np.testing.assert_array_equal(done[gap], render_bytes(filled, camera)[gap])
     np.testing.assert_array_equal(done[~gap], grey[~gap])
     assert (done[gap] != 128).any()
+    assert _redrawn({camera.id: grey}, filled, [one], {camera.id: ~gap})[camera.id] is grey
 
 
 def test_views_without_gaps_are_not_drawn_anew() -> None:
     camera = view().camera
     solid = replace(view(), alpha_after=np.ones_like(view().alpha_after))
     grey = np.full((camera.height, camera.width, 3), 128, np.uint8)
-    assert _redrawn({camera.id: grey}, floor(with_hole=False), [solid], [solid])[camera.id] is grey
+    everywhere = {camera.id: np.ones(grey.shape[:2], bool)}
+    assert _redrawn({camera.id: grey}, floor(with_hole=False), [solid], everywhere)[camera.id] is grey

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import Gaussians
-from .backend import Backend, PixelRegion, Trace, current_backend, use_backend
+from .backend import Backend, Drawing, PixelRegion, Trace, current_backend, use_backend
 from .types import (
     ALL_PASSES,
     PASSES,
@@ -21,6 +21,7 @@ from .types import (
     PictureGradients,
     RasterSettings,
     Rendering,
+    Window,
 )
 
 __all__ = [
@@ -28,18 +29,23 @@ __all__ = [
     "PASSES",
     "Backend",
     "Contributions",
+    "Drawing",
     "Gradients",
     "PictureGradients",
     "PixelRegion",
     "RasterSettings",
     "Rendering",
     "Trace",
+    "Window",
     "backward",
     "contributions",
+    "drawing",
     "footprint",
+    "label_weights",
     "pixel_region",
     "render",
     "surface_depth",
+    "touched_window",
     "trace",
     "use_backend",
 ]
@@ -50,6 +56,7 @@ def render(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> Rendering:
     """Draw a scene (paper eq. 1 and 2).
 
@@ -61,9 +68,9 @@ def render(
     Raises
     ------
     ValueError
-        If a pass is unknown.
+        If a pass is unknown, or the mask has not the picture's shape.
     """
-    return current_backend().render(gaussians, camera, settings, passes)
+    return current_backend().render(gaussians, camera, settings, passes, pixels)
 
 
 def trace(
@@ -108,27 +115,44 @@ def pixel_region(
     return current_backend().pixel_region(frozen, camera, pixels, settings, passes)
 
 
+def drawing(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings = RasterSettings(),
+    with_colour: bool = True,
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
+) -> Drawing:
+    """A view that is to be drawn in more than one way: the Gaussians are projected and sorted once.
+
+    Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
+    while a drawing is in use, and it is not for two threads at once.
+    """
+    return current_backend().drawing(gaussians, camera, settings, with_colour, pixels)
+
+
 def footprint(
     gaussians: Gaussians,
     camera: Camera,
     chosen: np.ndarray,  # [N] bool
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> np.ndarray:
     """Accumulated blend weight of the chosen Gaussians, [H, W] float32; others may hide them."""
-    return current_backend().footprint(gaussians, camera, chosen, settings)
+    return drawing(gaussians, camera, settings, False, pixels).footprint(chosen)
 
 
 def surface_depth(
     gaussians: Gaussians,
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
+    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha; both [H, W] float32.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
     splats (Yu 2024; Zhang 2024). 0 where alpha < 0.5.
     """
-    return current_backend().surface_depth(gaussians, camera, settings)
+    return drawing(gaussians, camera, settings, False, pixels).surface_depth()
 
 
 def contributions(
@@ -139,3 +163,25 @@ def contributions(
 ) -> Contributions:
     """Sum and maximum of every Gaussian's blend weights over the pixels of a view."""
     return current_backend().contributions(gaussians, camera, settings, pixels)
+
+
+def label_weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    labels: np.ndarray,  # [H, W] 0 where weights do not count, else 1 … count
+    count: int,
+    rows: np.ndarray | None = None,  # [N] bool: only these rows' weights are needed; others may come out too small
+    settings: RasterSettings = RasterSettings(),
+) -> np.ndarray:
+    """Sum of every Gaussian's blend weights over the pixels of each label, [count, N] float32."""
+    return current_backend().label_weights(gaussians, camera, settings, labels, count, rows)
+
+
+def touched_window(
+    gaussians: Gaussians,
+    camera: Camera,
+    margin: int = 0,  # pixels
+    settings: RasterSettings = RasterSettings(),
+) -> Window:
+    """A rectangle outside of which the Gaussians draw nothing, and a margin, within the picture; never empty."""
+    return current_backend().touched_window(gaussians, camera, margin, settings)

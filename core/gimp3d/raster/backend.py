@@ -9,9 +9,9 @@ import numpy as np
 from ..camera import Camera
 from ..gaussians import Gaussians
 from . import cpu
+from .cpu_drawing import CpuDrawing
 from .region import CpuPixelRegion
-from .surface import surface_depth
-from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering
+from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
 
 
 class Trace(Protocol):
@@ -32,11 +32,32 @@ class PixelRegion(Protocol):
         ...
 
 
+class Drawing(Protocol):
+    """A view of a scene, made ready once and drawn in several ways; see `drawing`."""
+
+    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+        """As `render`; of the drawing's own pixels only those given."""
+        ...
+
+    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """As `surface_depth`, without some Gaussians ([N] bool)."""
+        ...
+
+    def footprint(self, chosen: np.ndarray) -> np.ndarray:
+        """As `footprint`; only for drawings without colours."""
+        ...
+
+
 class Backend(Protocol):
     """What a backend must do; the functions of this package say what each means. Arrays are NumPy's, in and out."""
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
     ) -> Rendering: ...
 
     def trace(
@@ -52,17 +73,30 @@ class Backend(Protocol):
         passes: frozenset[str],
     ) -> PixelRegion: ...
 
-    def footprint(
-        self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
-    ) -> np.ndarray: ...
-
-    def surface_depth(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings
-    ) -> tuple[np.ndarray, np.ndarray]: ...
+    def drawing(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        with_colour: bool,
+        pixels: np.ndarray | None,
+    ) -> Drawing: ...
 
     def contributions(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
     ) -> Contributions: ...
+
+    def label_weights(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        labels: np.ndarray,
+        count: int,
+        rows: np.ndarray | None,
+    ) -> np.ndarray: ...
+
+    def touched_window(self, gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window: ...
 
 
 class CpuBackend:
@@ -71,9 +105,10 @@ class CpuBackend:
     render = staticmethod(cpu.render)
     trace = staticmethod(cpu.trace)
     pixel_region = staticmethod(CpuPixelRegion)
-    footprint = staticmethod(cpu.footprint)
-    surface_depth = staticmethod(surface_depth)
+    drawing = staticmethod(CpuDrawing)
     contributions = staticmethod(cpu.contributions)
+    label_weights = staticmethod(cpu.label_weights)
+    touched_window = staticmethod(cpu.touched_window)
 
 
 _current: Backend = CpuBackend()

@@ -14,7 +14,7 @@ from numba import float32, float64, int64, uint64
 
 from ..buffers import empty, zeros
 from ..jit import exact_kernel, inline_kernel
-from ..threads import parallel_map, thread_count
+from ..threads import parallel_map, run_ranges, thread_count
 from .project import (
     BOUND_X,
     BOUND_Y,
@@ -22,6 +22,7 @@ from .project import (
     DRAWN,
     HALF,
     HALF_HEIGHT,
+    HIDDEN,
     TILE,
     WHITEN_XX,
     WHITEN_XY,
@@ -71,18 +72,22 @@ def tile_lists(
     slots: np.ndarray,  # [down, across] int32: a tile's slot, −1 where it is not wanted
     with_records: bool,
 ) -> TileLists:
-    """Deal the drawn Gaussians into the wanted tiles."""
-    order = depth_order(features, states)
+    """Deal the drawn Gaussians into the wanted tiles; the states of those that reach none become HIDDEN."""
     tiles = np.flatnonzero(slots.ravel() >= 0).astype(np.int32)
+    if len(tiles) < slots.size:
+        sums = np.zeros((slots.shape[0] + 1, slots.shape[1] + 1), np.int32)
+        sums[1:, 1:] = (slots >= 0).cumsum(0).cumsum(1)
+        run_ranges(_hide_range, len(states), rects, sums, states)
+    order = depth_order(features, states)
     bounds = _chunks(len(order))
     chunks = range(len(bounds) - 1)
     places = np.zeros((len(chunks), len(tiles)), np.int64)
-    ordered = empty(len(order), np.int64)
+    ordered, masks = empty(len(order), np.int64), empty(len(order), np.uint64)
     spans = zeros((len(states) if with_records else 0, 2), np.int64)
     packed = rects.view(np.int64).ravel()
 
     def deal(k: int, entries: np.ndarray, record: int, records: np.ndarray) -> int:
-        part = bounds[k], bounds[k + 1], order, features, packed, ordered, slots, places[k]
+        part = bounds[k], bounds[k + 1], order, features, packed, ordered, masks, slots, places[k]
         return _deal(*part, entries, record, records, spans)
 
     none, no_records = np.empty(0, np.int32), np.empty(0, np.int64)
@@ -213,10 +218,45 @@ def cover_mask(flat, o, left, top, cell):
 
 
 @exact_kernel
-def _deal(lo, hi, order, features, rects, ordered, slots, places, entries, record, records, spans):
+def _hide_range(lo, hi, rects, sums, states):
+    """Hide what reaches no wanted tile; sums[v, u] counts those above row v and left of column u."""
+    for i in range(lo, hi):
+        if states[i] == DRAWN:
+            x0, y0, x1, y1 = rects[i, 0], rects[i, 1], rects[i, 2], rects[i, 3]
+            if sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0:
+                states[i] = HIDDEN
+
+
+@exact_kernel
+def mark_touched(rects, states, rows, touched):
+    """touched[v, u]: whether a drawn Gaussian of `rows` [N] bool may reach that tile."""
+    for i in range(len(rows)):
+        if rows[i] and states[i] == DRAWN:
+            for v in range(rects[i, 1], rects[i, 3]):
+                for u in range(rects[i, 0], rects[i, 2]):
+                    touched[v, u] = True
+
+
+@inline_kernel
+def _put(slot, g, record, counting, recording, places, entries, records):
+    """Count or write an entry; the next record."""
+    if slot < 0:
+        return record
+    place = places[slot]
+    places[slot] = place + 1
+    if not counting:
+        entries[place] = g
+        if recording:
+            records[place] = record
+    return record + 1
+
+
+@exact_kernel
+def _deal(lo, hi, order, features, rects, ordered, masks, slots, places, entries, record, records, spans):
     """Count the entries of each slot in `places`, or, when there is room for them, write them there.
 
-    The first pass leaves the rectangles in order of depth, for the second. Returns one past the last record.
+    The first pass leaves the rectangles in order of depth, and masks of tiles, for the second. Returns one past the
+    last record.
     """
     flat, width = features.reshape(-1), features.shape[1]
     counting, recording = len(entries) == 0, len(spans) > 0
@@ -229,25 +269,28 @@ def _deal(lo, hi, order, features, rects, ordered, slots, places, entries, recor
         x0, y0, x1, y1 = rect & 0xFFFF, (rect >> 16) & 0xFFFF, (rect >> 32) & 0xFFFF, (rect >> 48) & 0xFFFF
         first = record
         # of one row or column of tiles the bound reaches every one
-        exact = x1 - x0 > 1 and y1 - y0 > 1
-        for top in range(y0, y1, CELLS):
-            for left in range(x0, x1, CELLS):
-                columns, rows = min(x1 - left, CELLS), min(y1 - top, CELLS)
-                mask = ((uint64(1) << uint64(columns)) - uint64(1)) * (FIRST_COLUMN >> uint64(64 - 8 * rows))
-                if exact:
-                    mask &= cover_mask(flat, int64(g) * width, float32(left * TILE), float32(top * TILE), CELL)
-                while mask:
-                    bit = lowest_bit(mask)
-                    mask &= mask - uint64(1)
-                    slot = slots[top + (bit >> 3), left + (bit & 7)]
-                    if slot >= 0:
-                        place = places[slot]
-                        places[slot] = place + 1
-                        if not counting:
-                            entries[place] = g
-                            if recording:
-                                records[place] = record
-                        record += 1
+        if x1 - x0 == 1:
+            for v in range(y0, y1):
+                record = _put(slots[v, x0], g, record, counting, recording, places, entries, records)
+        elif y1 - y0 == 1:
+            for u in range(x0, x1):
+                record = _put(slots[y0, u], g, record, counting, recording, places, entries, records)
+        else:
+            small = x1 - x0 <= CELLS and y1 - y0 <= CELLS  # one mask holds all
+            for top in range(y0, y1, CELLS):
+                for left in range(x0, x1, CELLS):
+                    if small and not counting:
+                        mask = masks[k]
+                    else:
+                        columns, rows = min(x1 - left, CELLS), min(y1 - top, CELLS)
+                        mask = ((uint64(1) << uint64(columns)) - uint64(1)) * (FIRST_COLUMN >> uint64(64 - 8 * rows))
+                        mask &= cover_mask(flat, int64(g) * width, float32(left * TILE), float32(top * TILE), CELL)
+                        masks[k] = mask
+                    while mask:
+                        bit = lowest_bit(mask)
+                        mask &= mask - uint64(1)
+                        slot = slots[top + (bit >> 3), left + (bit & 7)]
+                        record = _put(slot, g, record, counting, recording, places, entries, records)
         if recording and not counting:
             spans[g, 0], spans[g, 1] = first, record
     return record

@@ -75,7 +75,7 @@ T, HELD, CLOSED, MEDIAN, R, G, B, Z, NX, NY, NZ, M1, M2 = range(0, 13 * 16, 16)
 PLANES = 13
 BLOCK_STATE = PLANES * 16
 TILE_STATE = BLOCKS * BLOCK_STATE
-COUNTED, WEIGHT_STATE = 48, 64  # weigh_range's state: T, HELD, CLOSED and this plane
+COUNTED = 48  # the first of weigh_range's planes after T, HELD and CLOSED: for each label whether pixels carry it
 
 
 @inline_kernel
@@ -111,7 +111,7 @@ def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, 
 
 @exact_kernel
 def region_blocks(pixels, across, blocks):
-    """The blocks of each tile that have a wanted pixel: pixels [H, W] bool, blocks [T] uint64 out."""
+    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [T] uint64 out."""
     for t in range(len(blocks)):
         blocks[t] = open_blocks(pixels, t % across * TILE, t // across * TILE, pixels.shape[1], pixels.shape[0])
 
@@ -191,7 +191,8 @@ def blend_range(
     surfels,  # features are of surfels
     limits,  # [6] float32: alpha_min, alpha_max, stop, near, low-pass factor of surfels, distortion's near
     shifts,  # [S] float32 > 0: depths (and their disparities) are summed less this one, against cancellation
-    flags,  # [5] bool: with rgb, expected depth, median depth, normals, distortion
+    flags,  # [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
+    # 1 + its Gaussian's row as int32 bits
     wanted,  # [S] uint64: blocks to draw
     front,  # [S, TILE_STATE] what lies before the entries, or empty
     masks,  # [P] uint64 out: blocks that each entry was blended into, or empty
@@ -344,6 +345,7 @@ def _finish(
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
     rgb, alpha, expected, median, normals, distortion = pictures
     depths = np.empty(16, np.float32)
+    numbers = depths.view(np.int32)
     mask = wanted
     while mask:
         b = lowest_bit(mask)
@@ -369,7 +371,9 @@ def _finish(
             for lane in range(16):
                 number = int64(load1(state, k + MEDIAN + lane))
                 depths[lane] = ZERO
-                if number > 0:
+                if number > 0 and flags[5]:
+                    numbers[lane] = entries[first + number - 1] + 1
+                elif number > 0:
                     row = features[entries[first + number - 1]]
                     depths[lane] = depth_at(row, u + lane % BLOCK, v + lane // BLOCK, surfels, limits)
             store_block(median, o, width, load16(depths, 0))
@@ -415,28 +419,33 @@ def weigh_range(
     features,
     surfels,
     limits,
-    pixels,  # [H, W] bool, True where weights count
-    sums,  # [P] out: Σ of the blend weights of each list entry; zero on entry
-    peaks,  # [P] out: their maximum
+    labels,  # [H, W] uint8: 0 where weights do not count, else 1 … K
+    sums,  # [K, P] out: Σ of the blend weights of each list entry over the pixels of a label; zero on entry
+    peaks,  # [P] out: their maximum over all labels
 ):
     """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count."""
     alpha_min, alpha_max, stop, near, disc = limits[0], limits[1], limits[2], limits[3], limits[4]
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
-    height, width = pixels.shape
-    state, covers = aligned_empty(BLOCKS * WEIGHT_STATE), np.empty(CHECK, np.uint64)
+    height, width = labels.shape
+    kinds = len(sums)
+    size = COUNTED + 16 * kinds
+    state, covers = aligned_empty(BLOCKS * size), np.empty(CHECK, np.uint64)
+    weight_sums = aligned_empty(16 * kinds)
     for j in range(lo, hi):
         slot = order[j]
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         for b in range(BLOCKS):
-            k = b * WEIGHT_STATE
+            k = b * size
             store16(state, k + T, one)
-            store16(state, k + COUNTED, none)
+            for label in range(kinds):
+                store16(state, k + COUNTED + 16 * label, none)
             for y in range(min(BLOCK, height - top - BLOCK * (b >> 3))):
                 for x in range(min(BLOCK, width - left - BLOCK * (b & 7))):
-                    if pixels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x]:
-                        state[k + COUNTED + 4 * y + x] = ONE
-        alive = open_blocks(pixels, left, top, width, height)
+                    label = int64(labels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x])
+                    if 0 < label <= kinds:
+                        state[k + COUNTED + 16 * (label - 1) + 4 * y + x] = ONE
+        alive = open_blocks(labels, left, top, width, height)
         first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size
@@ -444,11 +453,13 @@ def weigh_range(
                 _cover(entries, i, min(i + CHECK, end), end, flat, row_size, left, top, covers)
             mask = alive & covers[(i - first) % CHECK]
             log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
-            weight_sum, peak = none, none
+            peak = none
+            for label in range(kinds):
+                store16(weight_sums, 16 * label, none)
             while mask:
                 b = lowest_bit(mask)
                 mask &= mask - uint64(1)
-                k = b * WEIGHT_STATE
+                k = b * size
                 x, y = (
                     float32(left) + HALF + BLOCK_PX * float32(b & 7),
                     float32(top) + HALF + BLOCK_PX * float32(b >> 3),
@@ -468,19 +479,23 @@ def weigh_range(
                 before = load16(state, k + T)
                 weight = alpha * before
                 store16(state, k + T, before - weight)
-                weight = weight * load16(state, k + COUNTED)
-                weight_sum = weight_sum + weight
-                peak = max16(peak, weight)
-            sums[i], peaks[i] = sum16(weight_sum), highest16(peak)
+                for label in range(kinds):
+                    counted = weight * load16(state, k + COUNTED + 16 * label)
+                    store16(weight_sums, 16 * label, load16(weight_sums, 16 * label) + counted)
+                    peak = max16(peak, counted)
+            for label in range(kinds):
+                sums[label, i] = sum16(load16(weight_sums, 16 * label))
+            peaks[i] = highest16(peak)
             i += 1
             if (i - first) % CHECK == 0:
-                alive, _ = _close(state, WEIGHT_STATE, alive, float32(i - first), stop)
+                alive, _ = _close(state, size, alive, float32(i - first), stop)
 
 
 @exact_kernel
 def gather_weights(entries, sums, peaks, total_weight, peak):
-    """Add each entry's weights to its Gaussian, in list order."""
+    """Add each entry's weights to its Gaussian, in list order; sums [K, P], total_weight [K, N]."""
     for i in range(len(entries)):
         m = entries[i]
-        total_weight[m] += sums[i]
+        for label in range(len(sums)):
+            total_weight[label, m] += sums[label, i]
         peak[m] = max(peak[m], peaks[i])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,19 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..jit import announce_compilation
 from ..threads import parallel_map, run_ranges, thread_count
-from .bin import TileLists, tile_lists
-from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
+from .bin import TileLists, mark_touched, tile_lists
+from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
 from .project import (
-    BLUE,
     DEPTH,
+    DRAWN,
     ELLIPSE_ROW,
     HALF_LOG2E,
-    RED,
     SURFEL_ROW,
     TILE,
     UNUSABLE,
     project_range,
 )
-from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering
+from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
@@ -51,16 +50,20 @@ class View:
 
 
 def project(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, out: View | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    with_colour: bool,
+    out: View | None = None,
+    slots: np.ndarray | None = None,
 ) -> View:
-    """Feature rows of the Gaussians that reach the picture; into `out` where it is given."""
+    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `out` where it is given."""
     announce_compilation()
     n = len(gaussians)
     if out is None:
         features = empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
         out = View(features, empty((n, 4), np.int16), empty(n, np.int8))
     sh = raw(gaussians.sh)
-    across, down = tile_grid(camera)
     run_ranges(
         project_range,
         n,
@@ -71,8 +74,8 @@ def project(
         sh,
         sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
         pack_camera(camera),
-        across,
-        down,
+        *tile_grid(camera),
+        np.array((0, 0, *tile_grid(camera)) if slots is None else _rectangle(slots >= 0), np.int64),
         float(settings.near),
         float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
         float(settings.alpha_min),
@@ -83,6 +86,12 @@ def project(
         out.states,
     )
     return out
+
+
+def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """First column and row of what is set, and one past the last."""
+    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return (cols[0], rows[0], cols[-1] + 1, rows[-1] + 1) if len(rows) else (0, 0, 0, 0)
 
 
 def raw(values: np.ndarray) -> np.ndarray:
@@ -109,7 +118,7 @@ def pack_camera(camera: Camera) -> np.ndarray:
 
 
 def pass_flags(passes: frozenset[str]) -> np.ndarray:
-    """blend_range's flags, [5] bool: rgb, expected depth, median depth, normals, distortion.
+    """blend_range's flags, [6] bool: rgb, expected depth, median depth, normals, distortion, numbers for depths.
 
     Raises
     ------
@@ -119,7 +128,8 @@ def pass_flags(passes: frozenset[str]) -> np.ndarray:
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
-    return np.array(["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes])
+    wanted = ["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes]
+    return np.array([*wanted, False])
 
 
 def pack_limits(settings: RasterSettings) -> np.ndarray:
@@ -172,6 +182,31 @@ def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
 
 
+def wanted_tiles(camera: Camera, pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
+    if pixels is None:
+        return whole_picture(camera)
+    if pixels.shape != (camera.height, camera.width):
+        raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
+    blocks = wanted_blocks(camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
+    return slots_of(blocks > 0), blocks[blocks > 0]
+
+
+def wanted_blocks(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] uint8 which is not 0."""
+    across, down = tile_grid(camera)
+    blocks = np.empty(across * down, np.uint64)
+    region_blocks(pixels, across, blocks)
+    return blocks.reshape(down, across)
+
+
+def slots_of(
+    wanted: np.ndarray,  # [down, across] bool
+) -> np.ndarray:
+    """Slots [down, across] int32 of the wanted tiles in row-major order, −1 elsewhere."""
+    return np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1).astype(np.int32)
+
+
 @dataclass(frozen=True)
 class Trace:
     """What the way back needs of a rendering."""
@@ -204,22 +239,33 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
-def render(gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]) -> Rendering:
-    return _draw(gaussians, camera, settings, passes, keep=False)[0]
+def render(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    pixels: np.ndarray | None,
+) -> Rendering:
+    return _draw(gaussians, camera, settings, passes, False, pixels)[0]
 
 
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    return _draw(gaussians, camera, settings, passes, keep=True)
+    return _draw(gaussians, camera, settings, passes, True, None)
 
 
 def _draw(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], keep: bool
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    passes: frozenset[str],
+    keep: bool,
+    pixels: np.ndarray | None,
 ) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
-    view = project(gaussians, camera, settings, with_colour=bool(flags[0]))
-    slots, wanted = whole_picture(camera)
+    slots, wanted = wanted_tiles(camera, pixels)
+    view = project(gaussians, camera, settings, bool(flags[0]), slots=slots)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
     shifts = depth_shifts(lists, view.features)
     pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
@@ -374,31 +420,58 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     )
 
 
-def footprint(gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings) -> np.ndarray:
-    if chosen.shape != (len(gaussians),):
-        raise ValueError(f"chosen: expected shape {(len(gaussians),)}, got {chosen.shape}")
-    view = project(gaussians, camera, settings, with_colour=False)
-    view.features[:, RED : BLUE + 1] = chosen[:, None]  # painted white on black
-    slots, wanted = whole_picture(camera)
-    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=False)
-    black = replace(settings, background=(0.0, 0.0, 0.0))
-    flags, shifts = pass_flags(frozenset({"rgb"})), np.ones(len(wanted), np.float32)
-    pictures, _ = blend(gaussians, view, camera, black, flags, view.features, lists, wanted, shifts, keep=False)
-    return np.ascontiguousarray(as_rendering(pictures, camera, view.ignored).rgb[..., 0])
-
-
 def contributions(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
 ) -> Contributions:
+    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
+    total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
+    return Contributions(total[0], peak)
+
+
+def label_weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    labels: np.ndarray,
+    count: int,
+    rows: np.ndarray | None,
+) -> np.ndarray:
+    return _weigh(gaussians, camera, settings, labels, count, rows)[0]
+
+
+def _weigh(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    labels: np.ndarray,  # [H, W] 0 … count
+    count: int,
+    rows: np.ndarray | None,  # [N] bool: whose weights are asked for
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
     shape = (camera.height, camera.width)
-    counted = np.ones(shape, bool) if pixels is None else np.require(pixels, bool, ["C", "W"])
-    if counted.shape != shape:
-        raise ValueError(f"pixels: expected shape {shape}, got {counted.shape}")
+    if labels.shape != shape:
+        raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
-    lists = tile_lists(view.features, view.rects, view.states, whole_picture(camera)[0], with_records=False)
-    sums, peaks = np.zeros((2, len(lists.entries)), np.float32)
+    counted = np.require(labels, np.uint8, ["C", "W"])
+    wanted = wanted_blocks(camera, counted) > 0
+    if rows is not None:
+        touched = np.zeros(wanted.shape, bool)
+        mark_touched(view.rects, view.states, rows, touched)
+        wanted &= touched
+    lists = tile_lists(view.features, view.rects, view.states, slots_of(wanted), with_records=False)
+    sums, peaks = np.zeros((count, len(lists.entries)), np.float32), np.zeros(len(lists.entries), np.float32)
     limits = pack_limits(settings)
     over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)
-    total, peak = np.zeros((2, len(gaussians)), np.float32)
+    total, peak = np.zeros((count, len(gaussians)), np.float32), np.zeros(len(gaussians), np.float32)
     gather_weights(lists.entries, sums, peaks, total, peak)
-    return Contributions(total, peak)
+    return total, peak
+
+
+def touched_window(gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window:
+    view = project(gaussians, camera, settings, with_colour=False)
+    rects = view.rects[view.states == DRAWN]
+    if not len(rects):
+        return slice(0, 1), slice(0, 1)
+    left, top = TILE * rects[:, :2].min(0).astype(int) - margin
+    right, bottom = TILE * rects[:, 2:].max(0).astype(int) + margin
+    return slice(max(0, top), min(camera.height, bottom)), slice(max(0, left), min(camera.width, right))

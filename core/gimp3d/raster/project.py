@@ -356,6 +356,24 @@ def _tile_range(low, high, tiles):
 
 
 @inline_kernel
+def _misses(x, y, z, log_scale, camera, low_pass, reach, tiles):
+    """Whether a 3D Gaussian with this longest axis surely misses the tiles: a bound of what _ellipses gives."""
+    inverse_z = 1.0 / z
+    tan_x, tan_y = x * inverse_z, y * inverse_z
+    u, v = camera[12] * tan_x + camera[14], camera[13] * tan_y + camera[15]
+    beside = max(TILE * tiles[0] - u, u - TILE * tiles[2])  # px by which the centre lies beside them
+    beyond = max(TILE * tiles[1] - v, v - TILE * tiles[3])
+    if max(beside, beyond) <= 0.0:
+        return False
+    slope_x, slope_y = min(max(tan_x, camera[19]), camera[20]), min(max(tan_y, camera[21]), camera[22])
+    size = exp64(log_scale) * inverse_z
+    across, down = camera[12] * size, camera[13] * size
+    squared_width = reach * reach * (across * across * (1.0 + slope_x * slope_x) + low_pass)
+    squared_height = reach * reach * (down * down * (1.0 + slope_y * slope_y) + low_pass)
+    return (beside > 0.0 and beside * beside > squared_width) or (beyond > 0.0 and beyond * beyond > squared_height)
+
+
+@inline_kernel
 def stage(s, n, i, means, log_scales, quats, opacity_logits, camera):
     """Put Gaussian i into place n of the scratch planes, its mean in camera coordinates."""
     x, y, z = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
@@ -382,6 +400,7 @@ def project_range(
     camera,  # [23] float64: R (9), t (3), fx, fy, cx, cy, centre (3), bounds of x/z and y/z (−x, +x, −y, +y)
     across,  # tiles per row of tiles
     down,
+    tiles,  # [4] int64: first column and row of the tiles to draw, and one past the last
     near,
     low_pass,
     alpha_min,
@@ -398,6 +417,7 @@ def project_range(
     flat_sh, bands, basis = sh.reshape(-1), sh.shape[1], np.empty(BASIS_PLANES * CHUNK, np.float32)
     logit_min = -math.log(max(1.0 / alpha_min - 1.0, 1e-300))
     log2_alpha_min = math.log2(alpha_min)
+    reach = 1.001 * math.sqrt(max(-log2_alpha_min, 0.0) / HALF_LOG2E)  # of an opaque one, in standard deviations
     i = lo
     while i < hi:
         n = 0
@@ -408,7 +428,13 @@ def project_range(
                 states[i] = HIDDEN
                 px, py, pz = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
                 z = camera[6] * px + camera[7] * py + camera[8] * pz + camera[11]
-                if near <= z < FAR and opacity_logits[i] > logit_min:
+                meets = near <= z < FAR and opacity_logits[i] > logit_min
+                if meets and not surfels:
+                    x = camera[0] * px + camera[1] * py + camera[2] * pz + camera[9]
+                    y = camera[3] * px + camera[4] * py + camera[5] * pz + camera[10]
+                    longest = float64(max(log_scales[i, 0], log_scales[i, 1], log_scales[i, 2]))
+                    meets = not _misses(x, y, z, longest, camera, low_pass, reach, tiles)
+                if meets:
                     stage(s, n, i, means, log_scales, quats, opacity_logits, camera)
                     rows[n] = i
                     n += 1
@@ -417,15 +443,15 @@ def project_range(
             _surfels(s, n, camera, low_pass, log2_alpha_min)
         else:
             _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased)
-        _emit(s, n, rows, sh_bits, across, down, log2_alpha_min, surfels, flat, row_size, rects, states)
+        _emit(s, n, rows, sh_bits, across, down, tiles, log2_alpha_min, surfels, flat, row_size, rects, states)
         if with_colour:
             sh_basis(s, n, camera, bands, basis)
             _paint(n, rows, basis, bands, flat_sh, flat, row_size, states)
 
 
 @exact_kernel
-def _emit(s, n, rows, sh_bits, across, down, log2_alpha_min, surfels, flat, row_size, rects, states):
-    """Write the feature rows of the first n staged rows, unless they miss the picture."""
+def _emit(s, n, rows, sh_bits, across, down, tiles, log2_alpha_min, surfels, flat, row_size, rects, states):
+    """Write the feature rows of the first n staged rows, unless they miss the tiles to draw."""
     for k in range(n):
         i = rows[k]
         x, y = load1(s, OUT_X + k), load1(s, OUT_Y + k)
@@ -435,6 +461,8 @@ def _emit(s, n, rows, sh_bits, across, down, log2_alpha_min, surfels, flat, row_
         log2_opacity, xx = load1(s, OUT_LOG2 + k), load1(s, OUT_XX + k)
         placed = abs(x) < FAR and abs(y) < FAR and math.isfinite(xx) and log2_opacity > log2_alpha_min
         if not (placed and x0 < x1 and y0 < y1):
+            continue
+        if x1 <= tiles[0] or x0 >= tiles[2] or y1 <= tiles[1] or y0 >= tiles[3]:
             continue
         if not _finite_bits(sh_bits, i):
             states[i] = UNUSABLE

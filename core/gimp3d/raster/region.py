@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from ..jit import exact_kernel
 from . import cpu
 from .bin import TileLists, tile_lists
-from .blend import TILE_STATE, blend_range, region_blocks
+from .blend import TILE_STATE, blend_range
 from .project import DEPTH, ELLIPSE_ROW, SURFEL_ROW
 from .types import Gradients, PictureGradients, RasterSettings, Rendering
 
@@ -40,18 +40,9 @@ class CpuPixelRegion:
         settings: RasterSettings,
         passes: frozenset[str],
     ) -> None:
-        if pixels.shape != (camera.height, camera.width):
-            raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
         self.camera, self.settings, self.passes = camera, settings, passes
         self._flags = cpu.pass_flags(passes)
-        across, down = cpu.tile_grid(camera)
-        blocks = np.empty(across * down, np.uint64)
-        region_blocks(np.require(pixels, bool, ["C", "W"]), across, blocks)
-        self._slots = np.full(across * down, -1, np.int32)
-        self._slots[blocks > 0] = np.arange(np.count_nonzero(blocks))
-        self._slots = self._slots.reshape(down, across)
-        self._wanted = blocks[blocks > 0]
-
+        self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
         view = cpu.project(frozen, camera, settings, with_colour=bool(self._flags[0]))
         self._ignored = view.ignored
         lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)

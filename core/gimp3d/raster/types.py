@@ -9,6 +9,8 @@ import numpy as np
 PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal", "distortion"})
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})  # what a picture usually needs
 
+Window = tuple[slice, slice]  # rows and columns of a picture
+
 
 @dataclass(frozen=True)
 class RasterSettings:

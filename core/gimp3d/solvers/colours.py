@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 ROUNDS = 5  # of reweighting
+MORE_ROUNDS = 2  # the same from the weights of all pairs on, without one place
 CUT = 3.0  # robust standard deviations beyond which a pair counts for nothing (Tukey's biweight)
 LEAST_NOISE = 1.0  # grey levels
 LEAST_PAIRS = 20  # that a place must have to be asked
@@ -48,27 +49,27 @@ def learn_change(
     if len(colours) < 2 * LEAST_PAIRS:
         return NO_CHANGE
     x, y = _within_places(colours, places, weights), _within_places(change, places, weights)
-    matrix = _fit(x, y, weights, ridge)
+    matrix = _fit(x, y, weights, weights, ridge, ROUNDS)
+    kept = weights * _biweight(y - x @ matrix)
+    slopes = (kept[:, None] * x * y).sum(0) / ((kept[:, None] * x * x).sum(0) + LEAST_NOISE**2 * kept.sum() + 1e-9)
     explained, wanted = [], []
     for place in np.unique(places):
         here = (places == place) & (weights > 0)
         if here.sum() < LEAST_PAIRS or (~here).sum() < LEAST_PAIRS:
             continue
-        predicted = x[here] @ _fit(x[~here], y[~here], weights[~here], ridge)
-        kept = weights[here] * _biweight(y[here] - predicted)
-        explained.append((kept[:, None] * predicted * y[here]).sum())
-        wanted.append((kept[:, None] * predicted**2).sum())
+        without = _fit(x[~here], y[~here], weights[~here], kept[~here], ridge, MORE_ROUNDS)
+        predicted = x[here] @ without
+        counted = (weights[here] * _biweight(y[here] - predicted))[:, None]
+        explained.append((counted * predicted * y[here]).sum())
+        wanted.append((counted * predicted**2).sum())
     trust = 0.0
     if len(explained) >= 3 and sum(wanted) > 0:
         best = sum(explained) / sum(wanted)
         error = np.sqrt(np.sum((np.array(explained) - best * np.array(wanted)) ** 2)) / sum(wanted)
         trust = float(np.clip(best - error, 0.0, 1.0))
     centre = np.average(colours, axis=0, weights=weights)
-    kept = weights * _biweight(y - x @ matrix)
-    slopes = (kept[:, None] * x * y).sum(0) / ((kept[:, None] * x * x).sum(0) + LEAST_NOISE**2 * kept.sum() + 1e-9)
-    return ColourChange(
-        centre, matrix, _exposure(np.median(change[weights > 0], axis=0), trust * slopes * centre), trust
-    )
+    level = np.median(change[weights > 0], axis=0)
+    return ColourChange(centre, matrix, _exposure(level, trust * slopes * centre), trust)
 
 
 def exposure_gain(
@@ -100,10 +101,16 @@ def _within_places(values: np.ndarray, places: np.ndarray, weights: np.ndarray) 
     return values - means[places]
 
 
-def _fit(x: np.ndarray, y: np.ndarray, weights: np.ndarray, ridge: float) -> np.ndarray:
+def _fit(
+    x: np.ndarray,
+    y: np.ndarray,
+    weights: np.ndarray,
+    kept: np.ndarray,  # [N], the weights to begin with
+    ridge: float,
+    rounds: int,
+) -> np.ndarray:
     """[3, 3] M of y ≈ x M."""
-    kept = weights
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         scaled = x * kept[:, None]
         matrix = np.linalg.solve(scaled.T @ x + (ridge * kept.sum() + 1e-9) * np.eye(x.shape[1]), scaled.T @ y)
         kept = weights * _biweight(y - x @ matrix)
@@ -111,6 +118,6 @@ def _fit(x: np.ndarray, y: np.ndarray, weights: np.ndarray, ridge: float) -> np.
 
 
 def _biweight(residuals: np.ndarray) -> np.ndarray:
-    size = np.linalg.norm(residuals, axis=-1)
-    scale = CUT * (1.4826 * np.median(size) + LEAST_NOISE)
-    return np.maximum(0.0, 1 - (size / scale) ** 2) ** 2
+    squares = np.einsum("nc,nc->n", residuals, residuals)
+    scale = CUT * (1.4826 * np.sqrt(np.median(squares)) + LEAST_NOISE)
+    return np.maximum(0.0, 1 - squares / scale**2) ** 2

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import scipy.fft
 
 from ..jit import kernel
 from ..threads import run_ranges
@@ -205,6 +204,8 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
 
 def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
     """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT)."""
+    import scipy.fft  # takes a twentieth of a second, which removals that fill no picture need not wait for
+
     h, w, _ = along_x.shape
     divergence = np.zeros_like(along_x)
     divergence[:, :-1] += along_x[:, :-1]

@@ -34,24 +34,29 @@ class Exposure:
         return np.where(changed[..., None], _times(picture, self.gain), photo)
 
 
+def exposure_ring(view: ViewMasks) -> np.ndarray:
+    """[H, W] bool: the pixels round the object that a photo and the splats are compared in."""
+    silhouette = view.silhouette
+    if not silhouette.any():
+        return silhouette
+    distance = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, 5)
+    reach = max(LEAST_REACH, 0.5 * float(np.sqrt(silhouette.sum())))
+    return (distance > 0) & (distance <= reach) & (view.alpha_after > 0.9) & ~view.target
+
+
 def level_exposure(
-    view: ViewMasks,
+    ring: np.ndarray,  # [H, W] bool, see exposure_ring
     photo: np.ndarray,  # [H, W, 3] uint8
-    drawn: np.ndarray,  # [H, W, 3] uint8, the splats without the object
+    drawn: np.ndarray,  # [H, W, 3] uint8, the splats without the object; only the ring is looked at
 ) -> Exposure:
     """Divide a photo by its gain over the splats, measured round the object, if that clearly fits better."""
     unchanged = Exposure(photo, np.ones(3))
-    if not view.silhouette.any():
-        return unchanged
-    distance = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
-    reach = max(LEAST_REACH, 0.5 * float(np.sqrt(view.silhouette.sum())))
-    ring = (distance > 0) & (distance <= reach) & (view.alpha_after > 0.9) & ~view.target
     gain = exposure_gain(drawn[ring], photo[ring])
     if (gain > MAX_GAIN).any() or (gain < 1 / MAX_GAIN).any():
         return unchanged
-    level = _times(photo, 1 / gain)
-    if _difference(level[ring], drawn[ring]) < CLEARLY * _difference(photo[ring], drawn[ring]) - MARGIN:
-        return Exposure(level, gain)
+    level = _times(photo[ring], 1 / gain)
+    if _difference(level, drawn[ring]) < CLEARLY * _difference(photo[ring], drawn[ring]) - MARGIN:
+        return Exposure(_times(photo, 1 / gain), gain)
     return unchanged
 
 

@@ -16,25 +16,27 @@ from ..camera import Camera
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import footprint, render, surface_depth
+from ..raster import drawing, render, touched_window
 from ..threads import parallel_map
 from .outline import (
     Window,
     box_polygon,
     cropped,
     fill_polygon,
-    gaussians_window,
     guard_gaussians,
     surface_points,
+    window_mask,
     window_round,
 )
 from .selection import (
     Fate,
     Selection,
     SelectionSettings,
+    Shows,
     Sighting,
     boxes_of,
     by_centre,
+    near_region,
     object_and_rim,
     select,
     select_removed,
@@ -77,7 +79,11 @@ class MaskSettings:
 
 @dataclass(frozen=True)
 class ViewMasks:
-    """What a view shows before and after the removal; all arrays [H, W] of the view."""
+    """What a view shows before and after the removal; all arrays [H, W] of the view.
+
+    Hundreds of these are held at once, so all but `depth_before` and `alpha_after` are kept small and made anew each
+    time they are read.
+    """
 
     camera: Camera
     polygon: np.ndarray  # bool, the projected boxes
@@ -87,6 +93,46 @@ class ViewMasks:
     depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing, or nothing to be trusted
     depth_after: np.ndarray  # float32 z without it
     alpha_after: np.ndarray  # float32
+
+
+class _Bits:
+    """A field of ViewMasks that is a bool picture: kept as bits."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __set__(self, view: ViewMasks, mask: np.ndarray) -> None:
+        view.__dict__[self.name] = np.packbits(mask, axis=1), mask.shape[1]
+
+    def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
+        bits, width = view.__dict__[self.name]
+        return np.unpackbits(bits, axis=1, count=width).view(bool)
+
+
+class _LikeBefore:
+    """A field of ViewMasks that is a depth map: only the rectangle is kept in which it is not `depth_before`."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __set__(self, view: ViewMasks, depth: np.ndarray) -> None:
+        other = depth != view.depth_before
+        rows, cols = np.flatnonzero(other.any(1)), np.flatnonzero(other.any(0))
+        window = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] if len(rows) else np.s_[:0, :0]
+        view.__dict__[self.name] = window, depth[window].copy()
+
+    def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
+        window, values = view.__dict__[self.name]
+        depth = view.depth_before.copy()
+        depth[window] = values
+        return depth
+
+
+for _name, _kept in (
+    *((n, _Bits) for n in ("polygon", "silhouette", "occluder", "target")),
+    ("depth_after", _LikeBefore),
+):
+    setattr(ViewMasks, _name, _kept(_name))
 
 
 @dataclass(frozen=True)
@@ -153,16 +199,22 @@ def find_masks(
     selection = by_centre(inside)
     if not settings.selection.by_centre:
         selection, before = _choose(gaussians, region, before, passes, settings.selection)
-    kept, gone = gaussians.take(~selection.removed), gaussians.take(selection.removed)
-    after = passes.over(lambda b: _without(gaussians, kept, gone, selection.removed, b, settings), before)
+    gone = gaussians.take(selection.removed)
+    after = passes.over(lambda b: _without(gaussians, gone, selection.removed, b, settings), before)
     centre = np.mean([box.center for box in region], axis=0)
     sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)], centre)
-    needed = parallel_map(lambda k: _needed(before[k].camera, after[k], sight, centre, settings), range(len(after)))
     mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
-    if warnings or mode == "paper":
+    if warnings:
         mode = "paper"
-        needed = [_uncovered(gaussians, selection.removed, b, settings) for b in before]
-    views = tuple(_view_masks(b, a, n, not warnings, settings) for b, a, n in zip(before, after, needed))
+
+    def view_masks(k: int) -> ViewMasks:
+        if mode == "paper":
+            needed = _uncovered(gaussians, selection.removed, before[k], settings)
+        else:
+            needed = _needed(before[k].camera, after[k], sight, centre, settings)
+        return _view_masks(before[k], after[k], needed, not warnings, settings)
+
+    views = tuple(parallel_map(view_masks, range(len(before))))
     left_out = tuple(c.id for c in cameras if c not in seeing)
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
@@ -218,15 +270,24 @@ class _Before:
     window: Window  # of the region and a margin
     depth: np.ndarray
     alpha: np.ndarray
-    agrees: np.ndarray  # bool, the photo shows what the scene shows, as far as it was looked at
+    agrees: np.ndarray | None  # bool, of the window: the photo shows what the scene shows; None if there is none
     likeness: float  # correlation of photo and scene in the window; NaN if it cannot be told
     extra: np.ndarray | None  # bool, the extra mask
+
+    @property
+    def misfit(self) -> np.ndarray:
+        """[H, W] bool: the photo shows something else, as far as it was looked at."""
+        found = np.zeros(self.depth.shape, bool)
+        if self.agrees is not None:
+            found[self.window] = ~self.agrees
+        return found
 
 
 @dataclass(frozen=True)
 class _After:
-    """A view without the object; arrays [H, W]."""
+    """The part of a view that the object touched, and a margin, without the object; arrays of the window's size."""
 
+    window: Window
     depth: np.ndarray
     alpha: np.ndarray
     weight: np.ndarray  # blend weight of the removed Gaussians, with the object in place
@@ -247,15 +308,17 @@ def _look(
             raise BadInput(
                 f"masks: the {kind} of {camera.id} is {picture.shape[1]}×{picture.shape[0]}, not {size[1]}×{size[0]}"
             )
-    depth, alpha = surface_depth(gaussians, camera)
     window = window_round(np.concatenate(polygons), camera, settings.around)
-    agrees, likeness = np.ones(size, bool), np.nan
-    if photo is not None and not settings.selection.by_centre:
-        drawn = np.clip(render(gaussians, cropped(camera, window), passes=frozenset({"rgb"})).rgb, 0, 1)
+    agrees, likeness = None, np.nan
+    compare = photo is not None and not settings.selection.by_centre
+    scene = drawing(gaussians, camera, with_colour=compare)
+    depth, alpha = scene.surface_depth()
+    if photo is not None and compare:
+        drawn = np.clip(scene.render(frozenset({"rgb"}), window_mask(window, camera)).rgb[window], 0, 1)
         shown = photo[window] / np.float32(255)
         misfit = np.abs(drawn - shown).max(-1)
         limit = max(settings.selection.least_misfit, settings.selection.misfit * float(np.median(misfit)))
-        agrees[window], likeness = misfit <= limit, _correlation(drawn.mean(-1), shown.mean(-1))
+        agrees, likeness = misfit <= limit, _correlation(drawn.mean(-1), shown.mean(-1))
     return _Before(camera, polygons, window, depth, alpha, agrees, likeness, mask)
 
 
@@ -293,16 +356,19 @@ def _choose(
         return centre, views
 
     def sighting(view: _Before, object_: np.ndarray, ring: np.ndarray) -> Sighting:
-        clear = view.agrees & ~object_ & ~ring
+        shows = np.full(object_.shape, Shows.CLEAR, np.uint8)
+        shows[ring | view.misfit] = Shows.NOTHING
+        shows[object_] = Shows.OBJECT
         if view.extra is not None:
-            object_, clear = object_ & ~view.extra, clear & ~view.extra
-        return Sighting(view.camera, object_, clear, view.extra)
+            shows[view.extra] = Shows.MASKED
+        return Sighting(view.camera, shows, view.extra is not None)
 
-    sightings = [sighting(v, *s) for v, s in zip(views, seen)]
-    weights = weigh(gaussians, sightings)
+    sightings = parallel_map(lambda k: sighting(views[k], *seen[k]), range(len(views)))
+    near = near_region(gaussians, objects, settings)
+    weights = weigh(gaussians, near, sightings)
     selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o], settings)
     if settings.support > 0:
-        revealed = weigh_revealed(gaussians, selection, sightings)
+        revealed = weigh_revealed(gaussians, selection, near, sightings)
         selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, settings)
     alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
     return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), selection.fates)), views
@@ -310,28 +376,26 @@ def _choose(
 
 def _without(
     gaussians: Gaussians,
-    kept: Gaussians,
     gone: Gaussians,
     removed: np.ndarray,  # [N] bool
     view: _Before,
     settings: MaskSettings,
 ) -> _After:
     """A view without the object; only the part that the object touched is drawn anew."""
-    window = gaussians_window(gone, view.camera, settings.around)
-    part = cropped(view.camera, window)
-    depth, alpha, weight = view.depth.copy(), view.alpha.copy(), np.zeros_like(view.alpha)
-    depth[window], alpha[window] = surface_depth(kept, part)
-    weight[window] = footprint(gaussians, part, removed)
-    return _After(depth, alpha, weight)
+    window = touched_window(gone, view.camera, settings.around)
+    scene = drawing(gaussians, view.camera, with_colour=False, pixels=window_mask(window, view.camera))
+    depth, alpha, weight = (*scene.surface_depth(gone=removed), scene.footprint(removed))
+    return _After(window, depth[window].copy(), alpha[window].copy(), weight[window].copy())
 
 
 def _untrusted(before: _Before, after: _After, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels that are no evidence of what is behind the object."""
-    hidden = (after.weight > settings.hides) | ~before.agrees
+    hidden = before.misfit
+    hidden[after.window] |= after.weight > settings.hides
     return hidden if before.extra is None else hidden | before.extra
 
 
-def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, settings: MaskSettings) -> np.ndarray:
+def _needed(view: Camera, after: _After, sight: Sight, centre: np.ndarray, settings: MaskSettings) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw (METHOD section 1).
 
     A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
@@ -340,6 +404,7 @@ def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, set
     excluded: no view sees past what appears there or shows it within twice the tolerance, and the object hides it from
     more views than other surfaces do.
     """
+    camera = cropped(view, after.window)
     touched = after.weight > settings.changed
     solid = touched & (after.alpha >= settings.solid)
     window = window_round(np.argwhere(touched)[:, ::-1], camera, settings.around)
@@ -357,7 +422,9 @@ def _needed(camera: Camera, after: _After, sight: Sight, centre: np.ndarray, set
     evidence |= touched & ~solid & (cv2.dilate(void, np.ones((7, 7), np.uint8)) > 0)
     certain = after.weight > settings.hides
     certain[rows, cols] &= sight.of(points, 2 * settings.depth_tolerance) == HIDES
-    return _tidy(touched & ~evidence, certain, touched, settings.margin)
+    needed = np.zeros((view.height, view.width), bool)
+    needed[after.window] = _tidy(touched & ~evidence, certain, touched, settings.margin)
+    return needed
 
 
 def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: _Before, settings: MaskSettings) -> np.ndarray:
@@ -375,14 +442,19 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
 def _view_masks(
     before: _Before, after: _After, needed: np.ndarray, consistent: bool, settings: MaskSettings
 ) -> ViewMasks:
-    silhouette = after.weight > settings.changed
-    occluder = _in_front(before.depth, after.weight > 0.5, settings) & consistent  # else depths say nothing
-    beside = cv2.dilate(occluder.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0  # there T must not outgrow the object
-    target, depth = needed & ~occluder & (silhouette | ~beside), before.depth
+    window, depth, alpha = after.window, before.depth, before.alpha
+    silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
+    silhouette[window] = after.weight > settings.changed
+    if consistent:  # else depths say nothing
+        occluder[window] = _in_front(depth[window], after.weight > 0.5, settings)
+    beside[window] = cv2.dilate(occluder[window].astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    target = needed & ~occluder & (silhouette | ~beside)  # beside what is in front T must not outgrow the object
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
+    depth_after, alpha_after = before.depth.copy(), alpha
+    depth_after[window], alpha_after[window] = after.depth, after.alpha  # of alpha, what was before is not needed
     return ViewMasks(
-        before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, after.depth, after.alpha
+        before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, depth_after, alpha_after
     )
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from ..box import Box
 from ..camera import Camera
 from ..gaussians import Gaussians
+from ..raster import Window
 
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
-Window = tuple[slice, slice]  # rows and columns of a picture
 
 
 def box_polygon(
@@ -102,19 +102,11 @@ def box_window(box: Box, camera: Camera) -> Window:
     return window_round(camera.project(corners)[0], camera, 1)
 
 
-def gaussians_window(gaussians: Gaussians, camera: Camera, margin: int) -> Window:
-    """The rectangle round all that Gaussians can touch; the whole picture if one reaches behind the camera."""
-    usable = gaussians.usable
-    centres = camera.to_camera(gaussians.means[usable].astype(np.float64))
-    reach = 3.5 * gaussians.scales[usable].max(1)[:, None]  # alpha is below 1/255 from 3.33 standard deviations on
-    before = centres[:, 2:] + reach > 0
-    centres, reach = centres[before[:, 0]], reach[before[:, 0]]
-    near, far = centres[:, 2:] - reach, centres[:, 2:] + reach
-    if (near <= 0).any():
-        return slice(0, camera.height), slice(0, camera.width)
-    low, high = centres[:, :2] - reach, centres[:, :2] + reach
-    ends = np.concatenate([low / near, low / far, high / near, high / far])
-    return window_round(ends * [camera.fx, camera.fy] + [camera.cx, camera.cy], camera, margin)
+def window_mask(window: Window, camera: Camera) -> np.ndarray:
+    """[H, W] bool: the pixels of a view that lie in a window."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[window] = True
+    return mask
 
 
 def cropped(camera: Camera, window: Window) -> Camera:

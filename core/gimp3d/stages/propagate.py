@@ -92,7 +92,7 @@ class ViewToPaint:
     silhouette: np.ndarray  # [H, W] bool, touched by the object
     target: np.ndarray  # [H, W] bool, T_t
     depth_before: np.ndarray  # [H, W] z with the object
-    depth_new: np.ndarray  # [H, W] z of the scene with the new surface
+    depth_new: np.ndarray  # [H, W] z of the scene with the new surface; used within `near_hole`
 
 
 Loader = Callable[[], ViewToPaint]  # brings a view into memory; it is let go again once it is painted
@@ -108,6 +108,7 @@ class PaintedView:
     image: np.ndarray  # [h, w, 3] uint8, I_t*
     raw: np.ndarray  # [h, w, 3] uint8, before Poisson blending
     rules: np.ndarray  # [h, w] uint8, see Rule
+    depth: np.ndarray  # [h, w] z of the scene with the new surface
 
     def pasted(
         self,
@@ -137,6 +138,17 @@ class Propagation:
     views: tuple[PaintedView, ...]
     confidence: float
     reason: str
+
+
+def near_hole(target: np.ndarray, settings: PropagateSettings) -> tuple[slice, slice]:
+    """Rows and columns of what is looked at when the target [H, W] bool is painted; empty if that is."""
+    if not target.any():
+        return slice(0, 0), slice(0, 0)
+    return _bounds(target, _reach(target, settings))
+
+
+def _reach(target: np.ndarray, settings: PropagateSettings) -> int:
+    return max(LEAST_REACH, math.ceil(settings.surroundings * math.sqrt(target.sum())))
 
 
 def propagate(
@@ -252,8 +264,8 @@ class _Warp:
 def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: PropagateSettings) -> PaintedView:
     if not view.target.any():
         nothing = np.zeros((0, 0, 3), np.uint8)
-        return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0])
-    reach = max(LEAST_REACH, math.ceil(settings.surroundings * math.sqrt(view.target.sum())))
+        return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
+    reach = _reach(view.target, settings)
     near, top, left = _cropped(view, reach)
     same = _same_surface(near, settings)
     evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
@@ -289,6 +301,7 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         blended[rows, cols].copy(),
         _to_bytes(np.where(painted[..., None], raw, base)[rows, cols]),
         rules[rows, cols].copy(),
+        near.depth_new[rows, cols].astype(np.float32),
     )
 
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from ..camera import Camera
 from ..errors import IllPosed
+from ..solvers.thin_plate import ThinPlateSettings
 from ..threads import parallel_map
-from .depth import complete_disparity
+from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks, sees
+
+PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000))  # where the hidden surface is, about
 
 
 @dataclass(frozen=True)
@@ -122,20 +126,34 @@ def needed_surface(
 
 def _surface_in(view: ViewMasks, solid: float, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
     """Points and normals [M, 3] in the world and their spacing [M, 1], from one view's hole; none if it has no rim."""
+    camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / settings.samples))))
+    target, depth = view.target[part], view.depth_after[part]
     try:
-        completed = complete_disparity(disparity_of(view.depth_after), rim(view, solid), view.target)
+        completed = complete_disparity(disparity_of(depth), rim(view, solid)[part], target, settings=PROVISIONAL)
     except IllPosed:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
-    depth = np.where(view.target, completed.depth, view.depth_after)
-    normals = surface_normals(view.camera, depth)
-    rows, cols = np.nonzero(view.target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
-    stride = max(1, round(np.sqrt(len(rows) / settings.samples)))
-    grid = (rows % stride == 0) & (cols % stride == 0)
-    rows, cols = rows[grid], cols[grid]
+    depth = np.where(target, completed.depth, depth)
+    normals = surface_normals(camera, depth)
+    rows, cols = np.nonzero(target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
     z = depth[rows, cols].astype(np.float64)
-    points = view.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
-    spacing = 2 * stride * z / np.sqrt(view.camera.fx * view.camera.fy)
-    return points, normals[rows, cols] @ view.camera.R, spacing[:, None]
+    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
+    spacing = 2 * z / np.sqrt(camera.fx * camera.fy)
+    return points, normals[rows, cols] @ camera.R, spacing[:, None]
+
+
+def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
+    """Every step-th row and column of a view round its hole, which is not empty, and the camera that sees just these.
+
+    A surface that is only sampled need not be completed at every pixel.
+    """
+    margin = step * (PROVISIONAL.planes.ring + 2)
+    ends = ((x[0], x[-1]) for x in (np.flatnonzero(view.target.any(1 - axis)) for axis in (0, 1)))
+    rows, cols = (slice(max(0, int(first) - margin), int(last) + margin + 1, step) for first, last in ends)
+    height, width = view.target[rows, cols].shape
+    c = view.camera
+    cx, cy = (c.cx - cols.start - 0.5) / step + 0.5, (c.cy - rows.start - 0.5) / step + 0.5
+    camera = replace(c, width=width, height=height, fx=c.fx / step, fy=c.fy / step, cx=cx, cy=cy)
+    return camera, (rows, cols)
 
 
 def choose_reference(
@@ -239,7 +257,7 @@ def gather_evidence(
     camera: Camera,  # the reference
     depth: np.ndarray,  # [H, W] its completed z-depth
     target: np.ndarray,  # [H, W] bool, T_0
-    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
+    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
     settings: EvidenceSettings = EvidenceSettings(),
 ) -> Evidence:
     """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.

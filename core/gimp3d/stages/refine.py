@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ..camera import Camera
-from ..errors import BadInput
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
-from ..raster import PixelRegion, pixel_region
+from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_region
 from ..threads import parallel_map
 from .propagate import Rule
 
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
 C1, C2 = 0.01**2, 0.03**2
+BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 
 
 @dataclass(frozen=True)
@@ -88,14 +87,6 @@ class Refinement:
     reason: str
 
 
-def torch_is_there() -> bool:
-    try:
-        import torch  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 def refine_gaussians(
     frozen: Gaussians,  # the rest of the scene: its arrays are only read
     new: Gaussians,
@@ -108,38 +99,11 @@ def refine_gaussians(
 
     Every `held_out`-th view is left out of the gradient. The state that it likes best is kept, so the result is never
     worse there than the start. Without steps, views or new Gaussians the input is returned.
-
-    Raises
-    ------
-    BadInput
-        If torch is missing.
     """
     seen = [o for o in observations if (o.weight[o.target] > 0).any()]
     seen = seen[:: math.ceil(len(seen) / settings.views) or 1]
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
-    if not torch_is_there():
-        raise BadInput("refine: torch is not installed; pip install gimp3d[torch], or choose the preset draft")
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # sums are then the same on every machine; the rasteriser has threads of its own
-    try:
-        return _refine(frozen, new, seen, settings, seed, progress)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _refine(
-    frozen: Gaussians,
-    new: Gaussians,
-    seen: Sequence[Observation],
-    settings: RefineSettings,
-    seed: int,
-    progress: Progress,
-) -> Refinement:
-    import torch
-
     views = parallel_map(lambda o: _View(frozen, o, settings), seen)
     judges = views[settings.held_out // 2 :: settings.held_out] or views[:1]
     learners = [v for v in views if v not in judges] or views
@@ -147,24 +111,22 @@ def _refine(
     rng = np.random.default_rng(seed)
 
     def judged() -> float:
-        with torch.no_grad():
-            return float(np.mean([v.loss(state).item() for v in judges]))
+        active = state.gaussians
+        return float(np.mean(parallel_map(lambda v: v.loss(active), judges)))
 
     before = best = judged()
-    kept, kept_step, waited = state.gaussians(), 0, 0
+    kept, kept_step, waited = new, 0, 0
     order: list[int] = []
     for step in range(1, settings.steps + 1):
         if not order:
             order = list(rng.permutation(len(learners)))
-        state.optimiser.zero_grad()
-        learners[order.pop()].loss(state).backward()
-        state.step()
+        state.step(learners[order.pop()].slopes(state.gaussians))
         if step % settings.check == 0 or step == settings.steps:
             now = judged()
             progress("refine", step, settings.steps, f"held-out loss {now:.4f}")
             waited = 0 if now < best else waited + 1
             if now < best:
-                best, kept, kept_step = now, state.gaussians(), step
+                best, kept, kept_step = now, state.copied(), step
             if waited > settings.patience:
                 break
     reason = (
@@ -175,53 +137,44 @@ def _refine(
 
 
 class _State:
-    """The new Gaussians as torch parameters."""
+    """The new Gaussians on their way: Adam (Kingma 2015)."""
 
     def __init__(self, new: Gaussians, settings: RefineSettings) -> None:
-        import torch
-
-        self.new = new
         size = float(np.exp(np.median(new.log_scales)))
-        arrays = (new.means, new.log_scales, new.quats, new.opacity_logits, new.sh[:, :1], new.sh[:, 1:])
-        rates = (
-            settings.rate_means * size,
-            settings.rate_scales,
-            settings.rate_quats,
-            settings.rate_opacity,
-            settings.rate_colour,
-            settings.rate_view_dependence,
-        )
-        self.parameters = [torch.tensor(a, dtype=torch.float32, requires_grad=True) for a in arrays]
-        groups = [{"params": [p], "lr": r} for p, r in zip(self.parameters, rates) if p.numel()]
-        self.optimiser = torch.optim.Adam(groups, eps=1e-15)
+        colour = np.full((new.sh.shape[1], 1), settings.rate_view_dependence, np.float32)
+        colour[0] = settings.rate_colour
+        self.rates: dict[str, float | np.ndarray] = {
+            "means": settings.rate_means * size,
+            "log_scales": settings.rate_scales,
+            "quats": settings.rate_quats,
+            "opacity_logits": settings.rate_opacity,
+            "sh": colour,
+        }
+        self.gaussians = replace(new, **{name: getattr(new, name).copy() for name in self.rates})
+        self.moments = {name: np.zeros((2, *getattr(new, name).shape), np.float32) for name in self.rates}
+        self.steps = 0
 
-    def step(self) -> None:
-        import torch
+    def step(self, slopes: Gradients) -> None:
+        """Move along the gradients; one that is no number does not count."""
+        self.steps += 1
+        unbiased, unbiased_square = (1 - beta**self.steps for beta in BETAS)
+        for name, rate in self.rates.items():
+            slope = np.nan_to_num(getattr(slopes, name), nan=0.0, posinf=0.0, neginf=0.0)
+            mean, square = self.moments[name]
+            mean += (1 - BETAS[0]) * (slope - mean)
+            square += (1 - BETAS[1]) * (slope * slope - square)
+            values = getattr(self.gaussians, name)
+            values -= rate / unbiased * mean / (np.sqrt(square / unbiased_square) + EPSILON)
 
-        for p in self.parameters:
-            if p.grad is not None:
-                torch.nan_to_num_(p.grad, 0.0, 0.0, 0.0)
-        self.optimiser.step()
-
-    def gaussians(self) -> Gaussians:
-        means, log_scales, quats, opacity_logits, dc, rest = (p.detach().numpy() for p in self.parameters)
-        return replace(
-            self.new,
-            means=means.copy(),
-            log_scales=log_scales.copy(),
-            quats=quats.copy(),
-            opacity_logits=opacity_logits.copy(),
-            sh=np.concatenate([dc, rest], axis=1),
-        )
+    def copied(self) -> Gaussians:
+        return replace(self.gaussians, **{name: getattr(self.gaussians, name).copy() for name in self.rates})
 
 
 class _View:
     """A view's part of the loss: what does not change between steps is prepared once."""
 
     def __init__(self, frozen: Gaussians, observation: Observation, settings: RefineSettings) -> None:
-        import torch
-
-        self.settings, self.surfels, self.antialiased = settings, frozen.is_surfels, frozen.antialiased
+        self.settings, self.surfels, self.camera = settings, frozen.is_surfels, observation.camera
         size = 2 * settings.margin + 1
         counted = cv2.dilate(observation.target.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
         passes = {"rgb", "alpha"} | ({"normal", "distortion", "expected_depth"} if self.surfels else set())
@@ -233,37 +186,67 @@ class _View:
             slice(max(cols[0] - half, 0), cols[-1] + half + 1),
         )
         # Round the target the photo itself counts fully.
-        weight = np.where(observation.target, observation.weight, 1.0) * counted
-        self.image = torch.from_numpy(observation.image[self.window].astype(np.float32) / 255)
-        self.weight = torch.from_numpy(weight[self.window].astype(np.float32))
-        self.counted = torch.from_numpy(counted[self.window])
+        weight = (np.where(observation.target, observation.weight, 1.0) * counted)[self.window]
+        self.share = (weight / weight.sum()).astype(np.float32)  # of each pixel in the loss
+        self.image = observation.image[self.window].astype(np.float32) / 255
+        self.counted = counted[self.window]
+        self.mean = _blurred(self.image)
+        self.variance = _blurred(self.image**2) - self.mean**2
+        self.rays = _rays(observation.camera)[self.window].astype(np.float32) if self.surfels else None
 
-        self.rays = torch.from_numpy(_rays(observation.camera)[self.window].astype(np.float32))
+    def loss(self, active: Gaussians) -> float:
+        return self.judged(self.region.render(active))[0]
 
-    def loss(self, state: _State) -> Any:  # torch.Tensor, which is not imported here
-        import torch
+    def slopes(self, active: Gaussians) -> Gradients:
+        """The loss's gradient with respect to the new Gaussians."""
+        drawn, way_back = self.region.trace(active)
+        return way_back.backward(self.judged(drawn)[1])
 
-        from ..raster.autograd import rasterize
+    def judged(self, drawn: Rendering) -> tuple[float, PictureGradients]:
+        """The loss of a rendering, and its gradient with respect to that."""
+        part = drawn.rgb[self.window]
+        rgb = np.where(self.counted[..., None], np.clip(part, 0, 1), self.image)
+        off, share = rgb - self.image, self.share[..., None] / 3
+        likeness, uphill = self._ssim(rgb, share)
+        ssim = self.settings.ssim
+        loss = (1 - ssim) * float((np.abs(off) * share).sum()) + ssim * float(((1 - likeness) * share).sum())
+        slope = (1 - ssim) * np.sign(off) * share - ssim * uphill
+        slopes = {"rgb": slope * (self.counted[..., None] & (part >= 0) & (part <= 1))}
+        if self.rays is not None:
+            normals, depth = drawn.normals[self.window], drawn.expected_depth[self.window]
+            across, normals_slope, depth_slope = _misalignment(normals, depth, self.rays, self.share)
+            loss += self.settings.normal * across
+            loss += self.settings.distortion * float((drawn.distortion[self.window] * self.share).sum())
+            slopes["normals"] = self.settings.normal * normals_slope
+            slopes["expected_depth"] = self.settings.normal * depth_slope
+            slopes["distortion"] = self.settings.distortion * self.share
+        return loss, PictureGradients(**{name: self._whole(values) for name, values in slopes.items()})
 
-        means, log_scales, quats, opacity_logits, dc, rest = state.parameters
-        sh = torch.cat([dc, rest], 1)
-        drawn = rasterize(means, log_scales, quats, opacity_logits, sh, self.region, antialiased=self.antialiased)
-        total = self.weight.sum()
+    def _whole(self, values: np.ndarray) -> np.ndarray:
+        """A picture that is 0 outside of the window."""
+        picture = np.zeros((self.camera.height, self.camera.width, *values.shape[2:]), np.float32)
+        picture[self.window] = values
+        return picture
 
-        def mean(values: Any) -> Any:
-            return (values * self.weight).sum() / total
+    def _ssim(self, rgb: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The SSIM map [h, w, 3] (Wang 2004), and the gradient of Σ share · SSIM with respect to rgb."""
+        mean, square, product = _blurred(rgb), _blurred(rgb * rgb), _blurred(rgb * self.image)
+        brightness = mean**2 + self.mean**2 + C1
+        contrast = square - mean**2 + self.variance + C2
+        alike, together = 2 * mean * self.mean + C1, 2 * (product - mean * self.mean) + C2
+        ssim = alike * together / (brightness * contrast)
+        by_product = 2 * share * alike / (brightness * contrast)
+        by_square = -share * ssim / contrast
+        by_mean = 2 * share * (self.mean * (together - alike) / (brightness * contrast) - ssim * mean / brightness)
+        by_mean -= 2 * mean * by_square
+        slope = _blurred(by_mean) + 2 * rgb * _blurred(by_square) + self.image * _blurred(by_product)
+        return ssim, slope
 
-        def part(picture: Any) -> Any:
-            return picture[self.window]
 
-        rgb = torch.where(self.counted[..., None], part(drawn.rgb).clamp(0, 1), self.image)
-        absolute, structure = mean((rgb - self.image).abs().mean(-1)), mean((1 - _ssim(rgb, self.image)).mean(-1))
-        loss = (1 - self.settings.ssim) * absolute + self.settings.ssim * structure
-        if self.surfels:
-            across = (part(drawn.normals) * _normals(part(drawn.expected_depth), self.rays)).sum(-1)
-            loss = loss + self.settings.distortion * mean(part(drawn.distortion))
-            loss = loss + self.settings.normal * mean(1 - across)
-        return loss
+def _blurred(picture: np.ndarray) -> np.ndarray:
+    """Under SSIM's window, black all round; it is its own adjoint."""
+    kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
+    return cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
 
 
 def _rays(camera: Camera) -> np.ndarray:
@@ -272,26 +255,38 @@ def _rays(camera: Camera) -> np.ndarray:
     return np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
 
 
-def _normals(depth: Any, rays: Any) -> Any:  # torch.Tensor [H, W], [H, W, 3]
-    """Unit normals [H, W, 3] of a depth map, facing the camera (Huang 2024, eq. 16)."""
-    import torch
-
+def _misalignment(
+    drawn: np.ndarray,  # [h, w, 3] normals of the surfels
+    depth: np.ndarray,  # [h, w]
+    rays: np.ndarray,  # [h, w, 3]
+    share: np.ndarray,  # [h, w]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Σ share (1 − n·N), N the depth map's normals (Huang 2024, eq. 16), and its gradients by n and by the depth."""
     points = rays * depth[..., None]
-    right, down = (torch.gradient(points, dim=d)[0] for d in (1, 0))
-    return torch.nn.functional.normalize(torch.cross(down, right, dim=-1), dim=-1)
+    right, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normals, length = _facing(right, down)
+    loss = float((share * (1 - (drawn * normals).sum(-1))).sum())
+    towards = -share[..., None] * drawn
+    towards = (towards - normals * (normals * towards).sum(-1, keepdims=True)) / length
+    slope = _gradient_adjoint(np.cross(towards, down), 1) + _gradient_adjoint(np.cross(right, towards), 0)
+    return loss, -share[..., None] * normals, (slope * rays).sum(-1)
 
 
-def _ssim(a: Any, b: Any) -> Any:  # torch.Tensor [H, W, 3] each
-    """The SSIM map [H, W, 3] with a Gaussian window (Wang 2004)."""
-    import torch
+def _facing(right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals [h, w, 3] of a surface by its slopes, facing the camera, and the length before [h, w, 1]."""
+    across = np.cross(down, right)
+    length = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
+    return across / length, length
 
-    x = torch.arange(WINDOW, dtype=torch.float32) - WINDOW // 2
-    kernel = torch.exp(-(x**2) / (2 * SIGMA**2))
-    kernel = kernel / kernel.sum()
-    maps = torch.stack([a, b, a * a, b * b, a * b]).permute(0, 3, 1, 2).reshape(15, 1, *a.shape[:2])
-    rows = torch.nn.functional.conv2d(maps, kernel.view(1, 1, WINDOW, 1), padding=(WINDOW // 2, 0))
-    blurred = torch.nn.functional.conv2d(rows, kernel.view(1, 1, 1, WINDOW), padding=(0, WINDOW // 2))
-    mean_a, mean_b, aa, bb, ab = blurred.reshape(5, 3, *a.shape[:2]).permute(0, 2, 3, 1)
-    product = mean_a * mean_b
-    variances = aa - mean_a**2 + bb - mean_b**2
-    return (2 * product + C1) * (2 * (ab - product) + C2) / ((mean_a**2 + mean_b**2 + C1) * (variances + C2))
+
+def _gradient_adjoint(values: np.ndarray, axis: int) -> np.ndarray:
+    """The transpose of np.gradient along an axis."""
+    g = np.moveaxis(values, axis, 0)
+    out = np.zeros_like(g)
+    out[2:] += g[1:-1] / 2
+    out[:-2] -= g[1:-1] / 2
+    out[1] += g[0]
+    out[0] -= g[0]
+    out[-1] += g[-1]
+    out[-2] -= g[-1]
+    return np.moveaxis(out, 0, axis)

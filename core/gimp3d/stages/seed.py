@@ -12,11 +12,12 @@ import numpy as np
 from ..camera import Camera
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
-from ..raster import PictureGradients, RasterSettings, contributions, pixel_region
+from ..raster import PictureGradients, RasterSettings, contributions, pixel_region, touched_window
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
 from .masks import sees
-from .propagate import Loader, PaintedView, Rule, ViewToPaint
+from .outline import cropped, window_mask
+from .propagate import PaintedView, Rule
 from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
@@ -66,6 +67,8 @@ def seed_gaussians(
     """
     if settings.largest < 1 or settings.largest & (settings.largest - 1):
         raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")
+    part = _grid_round(target, settings.largest)
+    camera, image, depth, target = cropped(camera, part), image[part], depth[part], target[part]
     normals = surface_normals(camera, depth)
     there = target & (depth > 0) & (np.abs(normals).sum(-1) > 0)
     z = np.where(there, depth, 1.0).astype(np.float64)
@@ -96,6 +99,16 @@ def seed_gaussians(
         opacity_logits=np.full(len(z), np.log(settings.opacity / (1 - settings.opacity)), np.float32),
         sh=((colours / 255.0 - 0.5) / SH_C0)[:, None].astype(np.float32),
     )
+
+
+def _grid_round(target: np.ndarray, size: int) -> tuple[slice, slice]:
+    """Rows and columns of the squares of a grid that hold the target [H, W] bool, and of one more all round."""
+    ends = ((np.flatnonzero(target.any(1 - axis)), side) for axis, side in enumerate(target.shape))
+    rows, cols = (
+        slice(max(0, x[0] // size - 1) * size, min(side, (x[-1] // size + 2) * size)) if len(x) else slice(0, size)
+        for x, side in ends
+    )
+    return rows, cols
 
 
 def _patches(
@@ -212,7 +225,7 @@ def _sum(table: np.ndarray, rectangles: np.ndarray) -> np.ndarray:
 def colour_gaussians(
     seeds: Gaussians,
     reference: Camera,
-    views: Sequence[Loader],
+    views: Sequence[Camera],
     painted: Sequence[PaintedView],
     scene_degree: int,
     settings: SeedSettings = SeedSettings(),
@@ -233,7 +246,7 @@ def settle_gaussians(
     scene: Gaussians,  # without the new ones
     new: Gaussians,
     reference: Camera,
-    views: Sequence[Loader],
+    views: Sequence[Camera],
     painted: Sequence[PaintedView],
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
@@ -247,13 +260,17 @@ def settle_gaussians(
     That covering moves the texture away from whoever looks, by part of a splat. Splats a little under the surface move
     it back, from all sides: parallax draws what is deeper nearer to the viewer's foot.
     """
-    others = [(view, paint) for view, paint in zip(views, painted) if paint.camera_id != reference.id]
+    others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
     stride = max(1, math.ceil(len(others) / max(1, settings.looks)))
-    looks = [(load(), paint) for load, paint in others[::stride]]
+    looks = others[::stride]
     new = _sunk(new, reference, settings.sink)
     joined = scene.extended(new)
-    cameras = [reference, *(view.camera for view, _ in looks)]
-    peaks = parallel_map(lambda c: contributions(joined, c).peak[len(scene) :], cameras)
+
+    def peak(camera: Camera) -> np.ndarray:
+        there = window_mask(touched_window(new, camera), camera)
+        return contributions(joined, camera, pixels=there).peak[len(scene) :]
+
+    peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
     new = new.take(np.max(peaks, axis=0) >= settings.needed)
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(partial(_colour_step, scene, new), looks)
@@ -276,32 +293,30 @@ def _sunk(
     return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
 
 
-def _colour_step(
-    scene: Gaussians, new: Gaussians, look: tuple[ViewToPaint, PaintedView]
-) -> tuple[np.ndarray, np.ndarray]:
+def _colour_step(scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]) -> tuple[np.ndarray, np.ndarray]:
     """W's column sums, and Wᵀ (painted − drawn) in units of c_0, [N, 3] each, where the view's own pixels painted."""
-    view, paint = look
-    wanted = np.isin(paint.rule_map(view.camera.height, view.camera.width), OWN_RULES)
-    drawn, way_back = pixel_region(scene, view.camera, wanted, passes=frozenset({"rgb"})).trace(new)
-    missing = np.where(wanted[..., None], paint.pasted(view.base) / 255.0 - drawn.rgb, 0.0)
+    camera, paint = look
+    wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
+    drawn, way_back = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"})).trace(new)
+    picture = paint.pasted(np.zeros((*wanted.shape, 3), np.uint8))
+    missing = np.where(wanted[..., None], picture / 255.0 - drawn.rgb, 0.0)
     one = np.broadcast_to(wanted[..., None], missing.shape)
     weights, error = (way_back.backward(PictureGradients(rgb=g.astype(np.float32))).sh[:, 0] for g in (one, missing))
     return weights / SH_C0, error / SH_C0**2
 
 
 def _seen_in(
-    means: np.ndarray, load: Loader, paint: PaintedView, tolerance: float
+    means: np.ndarray, view: Camera, paint: PaintedView, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the seeds that a painted view shows by pixels of its own, the directions to them, and their colours."""
-    view = load()
-    visible = np.flatnonzero(sees(view.camera, view.depth_new, means, tolerance))
-    uv, _ = view.camera.project(means[visible])
+    height, width = paint.rules.shape
+    part = cropped(view, (slice(paint.top, paint.top + height), slice(paint.left, paint.left + width)))
+    visible = np.flatnonzero(sees(part, paint.depth, means, tolerance))
+    uv, _ = part.project(means[visible])
     cols, rows = uv.astype(int).T
-    rules = paint.rule_map(view.camera.height, view.camera.width)
-    own = np.isin(rules[rows, cols], OWN_RULES)
+    own = np.isin(paint.rules[rows, cols], OWN_RULES)
     index = visible[own]
-    colours = paint.image[rows[own] - paint.top, cols[own] - paint.left] / 255.0
-    return index, _towards(means[index], view.camera), colours
+    return index, _towards(means[index], view), paint.image[rows[own], cols[own]] / 255.0
 
 
 def _towards(means: np.ndarray, camera: Camera) -> np.ndarray:

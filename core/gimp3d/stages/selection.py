@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,11 +14,13 @@ from scipy.special import ndtri
 from ..box import Region, in_region
 from ..camera import Camera
 from ..gaussians import Gaussians, quats_to_matrices
-from ..raster import contributions
-from ..threads import parallel_map
+from ..raster import label_weights
+from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 from .surroundings import Surroundings, SurroundingsSettings
 
+R = TypeVar("R")
+BATCH = 32  # views whose weights are held at once
 PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
 
 
@@ -90,19 +93,30 @@ class Selection:
         return f"{int(self.removed.sum())} Gaussians go ({parts[0]}), in the region stay {parts[1]}"
 
 
+class Shows(IntEnum):
+    """What a pixel shows of the scene with the object, for the selection."""
+
+    NOTHING = 0  # that could be told: the object's rim, or the photo disagrees
+    OBJECT = 1  # the first surface is the object
+    CLEAR = 2  # it is something else
+    MASKED = 3  # under the user's extra mask
+
+
 @dataclass(frozen=True)
 class Sighting:
-    """What a view shows of the scene with the object, for the selection; masks are [H, W] bool."""
+    """What a view shows."""
 
     camera: Camera
-    object_: np.ndarray  # the first surface is the object
-    clear: np.ndarray  # it is something else, not at the object's rim, and the photo agrees
-    extra: np.ndarray | None  # the user's extra mask, if there is one for this view
+    shows: np.ndarray  # [H, W] uint8, see Shows
+    masked: bool  # it has an extra mask
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Each Gaussian's blend weight summed over pixels and views, with the object in place; all [N]."""
+    """Each Gaussian's blend weight summed over pixels and views, with the object in place; all [N].
+
+    `object_` and `clear` are whole near the boxes only, see `near_region`.
+    """
 
     object_: np.ndarray
     clear: np.ndarray
@@ -112,7 +126,9 @@ class Weights:
 
 def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
     """[N] bool: Gaussians whose centre lies in the region. Unusable rows are never removed."""
-    return in_region(region, gaussians.means.astype(np.float64)) & gaussians.usable
+    inside = in_region(region, gaussians.means.astype(np.float64))
+    inside[inside] = gaussians.take(inside).usable
+    return inside
 
 
 def by_centre(
@@ -198,21 +214,37 @@ def surface_in(
     return found
 
 
-def weigh(gaussians: Gaussians, sightings: Sequence[Sighting]) -> Weights:
-    """Where each Gaussian shows while the object is there: two passes per view, three with an extra mask."""
+def near_region(gaussians: Gaussians, region: Region, settings: SelectionSettings = SelectionSettings()) -> np.ndarray:
+    """[N] bool: rows of whose fate something but extra masks can decide."""
+    return _reaches(gaussians, region) | _surrounds(gaussians, region, settings)
 
-    def of(view: Sighting) -> list[np.ndarray]:
-        object_ = contributions(gaussians, view.camera, pixels=view.object_).total
-        clear = contributions(gaussians, view.camera, pixels=view.clear).total
-        if view.extra is None:
-            return [object_, clear]
-        return [object_, clear, contributions(gaussians, view.camera, pixels=view.extra).total, object_ + clear]
 
+def weigh(
+    gaussians: Gaussians,
+    near: np.ndarray,  # [N] bool, see near_region
+    sightings: Sequence[Sighting],
+) -> Weights:
+    """Where each Gaussian shows while the object is there: one pass per view."""
     sums = np.zeros((4, len(gaussians)))
-    for parts in parallel_map(of, sightings):
-        for total, part in zip(sums, parts):
-            total += part
+
+    def of(view: Sighting) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.ones(len(gaussians), bool) if view.masked else near
+        weights = label_weights(gaussians, view.camera, view.shows, Shows.MASKED if view.masked else Shows.CLEAR, rows)
+        return np.flatnonzero(rows), weights[:, rows]
+
+    for rows, (object_, clear, *masked) in _in_batches(of, sightings):
+        sums[0, rows] += object_
+        sums[1, rows] += clear
+        for under in masked:
+            sums[2, rows] += under
+            sums[3, rows] += object_ + clear
     return Weights(*sums)
+
+
+def _in_batches(work: Callable[[Sighting], R], views: Sequence[Sighting]) -> Iterator[R]:
+    """parallel_map, of which only some results are there at a time."""
+    for start in range(0, len(views), BATCH):
+        yield from parallel_map(work, views[start : start + BATCH])
 
 
 def select(
@@ -232,7 +264,8 @@ def select(
     on_object = weights.object_ / np.maximum(shown, 1e-9)
     visible = shown > settings.shown
     centre = select_removed(gaussians, region)
-    rows = np.flatnonzero(_reaches(gaussians, region) & gaussians.usable)
+    usable = gaussians.usable
+    rows = np.flatnonzero(_reaches(gaussians, region) & usable)
     mass = np.zeros(len(gaussians))
     mass[rows] = mass_inside(gaussians, rows, region)
     fates = np.zeros(len(gaussians), np.uint8)
@@ -249,17 +282,30 @@ def select(
         surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
         fates[inside[surface & clean]] = Fate.KEPT_SURFACE
     under_masks = weights.masked > np.maximum(settings.shown, settings.mostly * (weights.masked + weights.unmasked))
-    fates[under_masks & gaussians.usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
+    fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
 
 
-def weigh_revealed(gaussians: Gaussians, selection: Selection, sightings: Sequence[Sighting]) -> np.ndarray:
-    """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views."""
+def weigh_revealed(
+    gaussians: Gaussians,
+    selection: Selection,
+    near: np.ndarray,  # [N] bool, see near_region
+    sightings: Sequence[Sighting],
+) -> np.ndarray:
+    """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views.
+
+    Whole near the boxes only.
+    """
     stays = ~selection.removed
-    kept = gaussians.take(stays)
+    kept, wanted = gaussians.take(stays), near[stays]
     total = np.zeros(len(gaussians))
-    for part in parallel_map(lambda s: contributions(kept, s.camera, pixels=s.object_).total, sightings):
-        total[stays] += part
+    rows = np.flatnonzero(stays)[wanted]
+
+    def of(view: Sighting) -> np.ndarray:
+        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0, wanted]
+
+    for part in _in_batches(of, sightings):
+        total[rows] += part
     return total
 
 
@@ -275,12 +321,18 @@ def without_revealed(
 
     Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them.
     """
-    near = np.zeros(len(gaussians), bool)
-    for box in region:
-        local = (gaussians.means - box.center) @ box.axes
-        near |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
+    near = _surrounds(gaussians, region, settings)
     found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
     return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
+
+
+def _surrounds(gaussians: Gaussians, region: Region, settings: SelectionSettings) -> np.ndarray:
+    """[N] bool: the centre lies in a box or so near that a smear of the object may reach it."""
+    found = np.zeros(len(gaussians), bool)
+    for box in region:
+        local = (gaussians.means - box.center) @ box.axes
+        found |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
+    return found
 
 
 def mass_inside(
@@ -296,14 +348,17 @@ def mass_inside(
     uniform = (0.5 + np.outer(np.arange(samples), PLASTIC ** -np.arange(1.0, 4.0))) % 1
     normal = ndtri(uniform)
     inside = np.empty(len(rows))
-    for start in range(0, len(rows), 4096):
-        part = rows[start : start + 4096]
-        scales = gaussians.scales[part].astype(np.float64)
+
+    def work(lo: int, hi: int) -> None:
+        part = rows[lo:hi]
+        scales = np.exp(gaussians.log_scales[part]).astype(np.float64)
         axes = quats_to_matrices(gaussians.quats[part].astype(np.float64))[:, :, : scales.shape[1]]
         points = (
             np.einsum("mik,mk,sk->msi", axes, scales, normal[:, : scales.shape[1]]) + gaussians.means[part][:, None]
         )
-        inside[start : start + 4096] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
+        inside[lo:hi] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
+
+    run_ranges(work, len(rows), chunk=1024)
     return inside
 
 

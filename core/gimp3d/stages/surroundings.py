@@ -17,7 +17,7 @@ import scipy.ndimage
 from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..jit import exact_kernel
-from ..threads import parallel_map
+from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
@@ -88,12 +88,16 @@ def follow_surroundings(
     found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
     local = np.concatenate(found)
     keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T), dims)
-    x = local.T
+    filled = np.bincount(keys, minlength=math.prod(dims)) > 0
+    numbers = np.where(filled, np.cumsum(filled, dtype=np.int32) - np.int32(1), np.int32(-1))  # of cells with points
+    x, rows = local.T, numbers[keys]
     values = [None, *x, *(x[a] * x[b] for a, b in PAIRS)]
-    moments = np.stack([np.bincount(keys, v, math.prod(dims)).reshape(dims) for v in values])
-    there = moments[0] >= settings.least_points
-    points = (moments[1:4, there] / moments[0, there]).T
-    normals = _normals(moments, there)
+    moments = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in values], axis=1)
+    enough = moments[:, 0] >= settings.least_points
+    cells = np.stack(np.unravel_index(np.flatnonzero(filled)[enough], dims), axis=1)
+    points = moments[enough, 1:4] / moments[enough, :1]
+    normals = _normals(moments, numbers.reshape(dims), cells)
+    there = tuple(cells.T)
     numbers = np.full(dims, -1, np.int32)
     numbers[there] = np.arange(len(points))
     edge = (np.abs(points) > half - settings.seeds * box.size).any(1)
@@ -101,7 +105,7 @@ def follow_surroundings(
     turn, steady = math.cos(math.radians(settings.turn)), math.cos(math.radians(settings.steady))
     limits = np.array([settings.step * cell, turn, steady, settings.adapt, settings.support])
     planes = np.concatenate([points, normals], axis=1)
-    _grow(numbers, np.argwhere(there), points, normals, limits, reached, planes)
+    _grow(numbers, cells, points, normals, limits, reached, planes)
     nearest = np.full(dims, -1, np.int32)
     nearest[there] = np.where(reached, np.cumsum(reached) - 1, -1)
     far, (i, j, k) = scipy.ndimage.distance_transform_edt(nearest < 0, return_indices=True)
@@ -119,16 +123,44 @@ def _points_in(box: Box, half: np.ndarray, cell: float, camera: Camera, depth: n
 
 
 def _normals(
-    moments: np.ndarray,  # [10, …] of the grid's cells
-    there: np.ndarray,  # […] bool
+    moments: np.ndarray,  # [C, 10] of the cells with points: their number, sums of coordinates, sums of products
+    numbers: np.ndarray,  # grid of int32: such a cell's row, −1 elsewhere
+    cells: np.ndarray,  # [M, 3] those that are asked for
 ) -> np.ndarray:
     """The direction in which the points of a cell and its neighbours spread least, [M, 3] (Hoppe 1992)."""
-    total = np.stack([scipy.ndimage.uniform_filter(m, 3, mode="constant")[there] for m in moments])
-    mean = total[1:4] / total[0]
-    covariance = np.empty((total.shape[1], 3, 3))
-    for m, (a, b) in zip(total[4:], PAIRS):
-        covariance[:, a, b] = covariance[:, b, a] = m / total[0] - mean[a] * mean[b]
-    return np.linalg.eigh(covariance)[1][:, :, 0]
+    normals = np.empty((len(cells), 3))
+
+    def work(lo: int, hi: int) -> None:
+        total = np.zeros((hi - lo, moments.shape[1]))
+        _add_neighbours(cells[lo:hi], numbers, moments, total)
+        mean = total[:, 1:4] / total[:, :1]
+        covariance = np.empty((hi - lo, 3, 3))
+        for k, (a, b) in enumerate(PAIRS):
+            covariance[:, a, b] = covariance[:, b, a] = total[:, 4 + k] / total[:, 0] - mean[:, a] * mean[:, b]
+        normals[lo:hi] = np.linalg.eigh(covariance)[1][:, :, 0]
+
+    run_ranges(work, len(cells))
+    return normals
+
+
+@exact_kernel
+def _number(numbers, i, j, k):
+    if 0 <= i < numbers.shape[0] and 0 <= j < numbers.shape[1] and 0 <= k < numbers.shape[2]:
+        return numbers[i, j, k]
+    return -1
+
+
+@exact_kernel
+def _add_neighbours(cells, numbers, moments, total):
+    """total[i]: the sum of the moments of cell i and its 26 neighbours."""
+    for i in range(len(cells)):
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                for dz in range(-1, 2):
+                    other = _number(numbers, cells[i, 0] + dx, cells[i, 1] + dy, cells[i, 2] + dz)
+                    if other >= 0:
+                        for k in range(total.shape[1]):
+                            total[i, k] += moments[other, k]
 
 
 @exact_kernel
@@ -182,10 +214,3 @@ def _grow(numbers, cells, points, normals, limits, reached, planes):
                 planes[row, 3], planes[row, 4], planes[row, 5] = nx / length, ny / length, nz / length
         front = waiting[accepted]
         reached[front] = True
-
-
-@exact_kernel
-def _number(numbers, i, j, k):
-    if 0 <= i < numbers.shape[0] and 0 <= j < numbers.shape[1] and 0 <= k < numbers.shape[2]:
-        return numbers[i, j, k]
-    return -1

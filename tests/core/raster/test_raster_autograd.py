@@ -152,6 +152,14 @@ class FakeTrace:
 
 
 @dataclass
+class FakeDrawing:
+    shape: tuple[int, int]
+
+    def footprint(self, chosen: np.ndarray) -> np.ndarray:
+        return np.full(self.shape, 8, np.float32)
+
+
+@dataclass
 class FakeBackend:
     """Draws pictures that are 7 everywhere, and notes what it was asked."""
 
@@ -159,7 +167,12 @@ class FakeBackend:
     traces: list[FakeTrace] = field(default_factory=list)
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None = None,
     ) -> Rendering:
         self.seen.append(gaussians)
         size = (camera.height, camera.width)
@@ -172,10 +185,9 @@ class FakeBackend:
         self.traces.append(FakeTrace(gaussians))
         return self.render(gaussians, camera, settings, passes), self.traces[-1]
 
-    def footprint(
-        self, gaussians: Gaussians, camera: Camera, chosen: np.ndarray, settings: RasterSettings
-    ) -> np.ndarray:
-        return np.full((camera.height, camera.width), 8, np.float32)
+    def drawing(self, gaussians: Gaussians, camera: Camera, *_: object) -> FakeDrawing:
+        self.seen.append(gaussians)
+        return FakeDrawing((camera.height, camera.width))
 
     def contributions(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scenes import cameras
 
-from gimp3d.stages.exposure import level_exposure
+from gimp3d.stages.exposure import exposure_ring, level_exposure
 from gimp3d.stages.masks import ViewMasks
 
 CAMERA = cameras(1)[0]
@@ -35,7 +35,7 @@ def test_another_exposure_is_taken_out_and_put_back(gain: float) -> None:
     photo = np.clip(gain * drawn() + noise, 0, 255).astype(np.uint8)
     photo[30:60, 40:80] = (220, 10, 10)  # the object says nothing of the exposure
     photo[:, 82:90] = 0  # nor does what the splats do not have
-    found = level_exposure(view(), photo, drawn())
+    found = level_exposure(exposure_ring(view()), photo, drawn())
     np.testing.assert_allclose(found.gain, gain, rtol=0.02)
     changed = np.zeros(SHAPE, bool)
     changed[30:60, 40:80] = True
@@ -47,12 +47,12 @@ def test_another_exposure_is_taken_out_and_put_back(gain: float) -> None:
 @pytest.mark.parametrize("noise", [0, 8])
 def test_a_photo_of_the_splats_exposure_stays_bit_for_bit(noise: float) -> None:
     photo = np.clip(drawn() + np.random.default_rng(5).normal(0, noise, (*SHAPE, 3)), 0, 255).astype(np.uint8)
-    found = level_exposure(view(), photo, drawn())
+    found = level_exposure(exposure_ring(view()), photo, drawn())
     assert found.image is photo and (found.gain == 1).all()
 
 
 def test_a_photo_of_something_else_is_left_as_it_is() -> None:
     photo = np.random.default_rng(6).integers(0, 255, (*SHAPE, 3)).astype(np.uint8)
-    assert level_exposure(view(), photo, drawn()).image is photo
+    assert level_exposure(exposure_ring(view()), photo, drawn()).image is photo
     dark = (drawn() // 16).astype(np.uint8)
-    assert level_exposure(view(), dark, drawn()).image is dark
+    assert level_exposure(exposure_ring(view()), dark, drawn()).image is dark

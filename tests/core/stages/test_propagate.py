@@ -361,7 +361,9 @@ def test_holes_of_any_size_at_any_place_are_painted(
 
 def test_a_part_is_pasted_where_it_belongs() -> None:
     rules = np.array([[0, Rule.OWN_PIXELS], [Rule.UNREACHED, 0]], np.uint8)
-    part = PaintedView("v", 3, 1, np.full((2, 2, 3), 9, np.uint8), np.full((2, 2, 3), 5, np.uint8), rules)
+    part = PaintedView(
+        "v", 3, 1, np.full((2, 2, 3), 9, np.uint8), np.full((2, 2, 3), 5, np.uint8), rules, np.ones((2, 2))
+    )
     picture = np.zeros((6, 4, 3), np.uint8)
     changed = np.argwhere(part.pasted(picture).any(-1)).tolist()
     assert changed == [[3, 2], [4, 1]] and not picture.any()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -162,7 +161,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
     def brightness(directions: np.ndarray) -> np.ndarray:
         return 0.5 + 0.2 * directions[..., 0]
 
-    views, painted = [], []
+    painted = []
     for k, (camera, depth) in enumerate(zip(everywhere, depths)):
         rows, cols = np.indices(depth.shape) + 0.5
         points = camera.unproject(np.stack([cols.ravel(), rows.ravel()], -1), np.maximum(depth, 1e-3).ravel())
@@ -171,9 +170,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
         image = np.repeat(np.rint(255 * grey)[..., None], 3, -1).astype(np.uint8)
         rules = np.full(depth.shape, Rule.OWN_PIXELS if k % 3 else Rule.REFERENCE, np.uint8)
         image[rules == Rule.REFERENCE] = 255
-        nothing = np.zeros(depth.shape, bool)
-        views.append(partial(ViewToPaint, camera, image, image, nothing, ~nothing, depth, depth))
-        painted.append(PaintedView(camera.id, 0, 0, image, image, rules))
+        painted.append(PaintedView(camera.id, 0, 0, image, image, rules, depth))
     target = np.zeros(depths[1].shape, bool)
     target[30:60, 40:80] = depths[1][30:60, 40:80] > 0
     flat = np.full((*target.shape, 3), 128, np.uint8)
@@ -182,7 +179,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
     loose = SeedSettings(harmonics=HarmonicsSettings(floor=0.01, offset=True))
-    coloured = colour_gaussians(seeds, reference, views, painted, 3, loose)
+    coloured = colour_gaussians(seeds, reference, everywhere, painted, 3, loose)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9
 
@@ -196,7 +193,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
         change = shown(towards)[:, 0] - shown(to_reference)[:, 0]
         expected = brightness(towards) - brightness(to_reference)
         assert np.median(np.abs(change - expected)) < 0.03
-    careful = colour_gaussians(seeds, reference, views, painted, 3)  # the default holds on to c_0 harder
+    careful = colour_gaussians(seeds, reference, everywhere, painted, 3)  # the default holds on to c_0 harder
     assert 0 < np.abs(careful.sh[:, 1:]).mean() < np.abs(coloured.sh[:, 1:]).mean()
 
 
@@ -209,14 +206,14 @@ def _hole_and_truth(count: int = 9) -> tuple[list[ViewToPaint], list[PaintedView
         rules = np.where(target, Rule.OWN_PIXELS, Rule.UNTOUCHED).astype(np.uint8)
         depth = drawn.median_depth
         views.append(ViewToPaint(camera, image, image, target, target, depth, depth))
-        painted.append(PaintedView(camera.id, 0, 0, image, image, rules))
+        painted.append(PaintedView(camera.id, 0, 0, image, image, rules, depth))
     return views, painted
 
 
 def _filled(views: list[ViewToPaint], painted: list[PaintedView], chosen: SeedSettings) -> Gaussians:
     known, view = floor(with_hole=True), views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False, chosen)
-    return settle_gaussians(known, seeds, view.camera, [partial(lambda v: v, v) for v in views], painted, chosen)
+    return settle_gaussians(known, seeds, view.camera, [v.camera for v in views], painted, chosen)
 
 
 def test_settled_colours_leave_no_seam_and_show_every_view_better_than_pixel_colours() -> None:
@@ -249,11 +246,11 @@ def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
     view = views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
     below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
-    load = [partial(lambda v: v, v) for v in views]
-    new = settle_gaussians(truth(), below, view.camera, load, painted, SeedSettings(corrections=0))
+    seen_from = [v.camera for v in views]
+    new = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
     assert len(new) < 0.1 * len(below)  # the floor hides them
     everything = settle_gaussians(
-        truth(), below, view.camera, load, painted, SeedSettings(needed=0, corrections=0, sink=0)
+        truth(), below, view.camera, seen_from, painted, SeedSettings(needed=0, corrections=0, sink=0)
     )
     assert np.array_equal(everything.means, below.means)
 
