@@ -157,7 +157,7 @@ class Worker:
 
     def words(self, pace: float = 1.0) -> str:
         """What to show: the stage and, of a removal, the time left."""
-        if self._clock is None:
+        if self._clock is None or self.summary is not None:
             return self.status
         left = self._clock.seconds_left(time.monotonic() - self._started, pace)
         return f"{self.status} · about {duration(left)} left"

@@ -24,7 +24,7 @@ from real_blender import PYTHON, ROOT, SUITES, RealBlender, save_jpeg
 
 LABELS = (
     *("Import Splats", "scene.ply", "Cursor", "Import Cameras", "transforms.json", "Orbit round the Box"),
-    *("Remove Object", "Before / After", "Export", "Export Splat PLY"),
+    *("Remove Object", "Export", "Export Splat PLY", "Import PLY", "OK"),
 )
 ALIKE = 0.8  # correlation from which on a label is found
 PATIENCE = 60  # s for a click to show, and for a label to come
@@ -48,15 +48,16 @@ bpy.ops.gimp3d.export_ply(filepath="/share/script.ply")
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and its box; without a camera file the views are an orbit."""
+    """A scene and its box."""
 
     folder: Path
-    cameras: bool
+    cameras: bool  # a file of them; else the views are an orbit
+    dropped: bool  # the scene is dropped into the 3D view; else chosen in the file browser
 
 
 CASES = {
-    "demo": Case(ROOT / "assets" / "demo", cameras=True),
-    "playbot": Case(ROOT.parent / "shared" / "data" / "real" / "playbot", cameras=False),
+    "demo": Case(ROOT / "assets" / "demo", cameras=True, dropped=False),
+    "playbot": Case(ROOT.parent / "shared" / "data" / "real" / "playbot", cameras=False, dropped=True),
 }
 
 
@@ -82,6 +83,12 @@ class Mouse:
             self._xdotool("mousemove", *VIEW)  # a tooltip may hide what is looked for
         self.shot(label)
 
+    def see(self, label: str) -> None:
+        if not self._wait(lambda: self._find(label) is not None, PATIENCE):
+            self.shot("lost")
+            sys.exit(f"by_mouse: nothing on the screen reads {label!r}; see {self.out}")
+        self.shot(label)
+
     def type(self, *keys: str) -> None:
         """Press keys over the 3D view; a number is typed digit by digit."""
         self._xdotool("mousemove", *VIEW, "sleep", "0.3")
@@ -100,6 +107,7 @@ class Mouse:
 
     def shot(self, name: str) -> None:
         self._shots += 1
+        time.sleep(3)  # llvmpipe takes its time to draw
         clean = "".join(c if c.isalnum() else "_" for c in name)
         save_jpeg(self.out / f"{self._shots:02d}-{clean}.jpg", self.blender.picture())
 
@@ -164,8 +172,16 @@ def by_mouse(mouse: Mouse, case: Case) -> Sequence[float]:
     while not (mouse.blender.share / "state.json").exists():
         time.sleep(0.5)
     region = json.loads((case.folder / "roi.json").read_text())
-    mouse.click("Import Splats", "scene.ply")
-    mouse.click("scene.ply", lambda s: s["splats"] == 1, then=["Return"])
+    if case.dropped:
+        mouse.type()  # nothing: a menu opens where the mouse is, and closes when it leaves
+        (mouse.blender.share / "drop").touch()
+        mouse.see("Import PLY")  # Blender's own importer takes the file too, so a menu asks
+        mouse.type("s")  # the letter underlined in Import Splats, which the panel's button reads as well
+        mouse.click("OK", lambda s: s["splats"] == 1)
+    else:
+        mouse.click("Import Splats", "scene.ply")
+        mouse.click("scene.ply", lambda s: s["splats"] == 1, then=["Return"])
+    mouse.type("Home")
     mouse.click("Cursor", lambda s: len(s["boxes"]) == 1)
     x, y, z = (str(v) for v in region["center"])
     mouse.type("g", x, "Tab", y, "Tab", z, "Return", "alt+s")

@@ -69,6 +69,14 @@ def drawn(label: str) -> np.ndarray:
     return np.array(pixels.to_list(), np.uint8).reshape(height, width, 4)[::-1, :, 0]
 
 
+def drop() -> None:
+    """What Blender calls when a file is let go over the 3D view; the mouse of X cannot bring one."""
+    area = next(a for a in bpy.context.window.screen.areas if a.type == "VIEW_3D")
+    region = next(r for r in area.regions if r.type == "WINDOW")
+    with bpy.context.temp_override(area=area, region=region):
+        bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=f"{SHARE}/", files=[{"name": "scene.ply"}])
+
+
 def tell() -> None:
     base = importlib.import_module(f"{EXTENSION}.gimp3d_addon.operators.base")
     splats = importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats")
@@ -97,6 +105,9 @@ def tick() -> float:
         next(readying)
         wait = 2.0
     except StopIteration:
+        if (SHARE / "drop").exists():
+            (SHARE / "drop").unlink()
+            drop()
         tell()
         wait = TICK
     due[0] = time.monotonic() + wait
