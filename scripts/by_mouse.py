@@ -24,7 +24,7 @@ from real_blender import PYTHON, ROOT, SUITES, RealBlender, save_jpeg
 
 LABELS = (
     *("Import Splats", "scene.ply", "Cursor", "Import Cameras", "transforms.json", "Orbit round the Box"),
-    *("Remove Object", "Export", "Export Splat PLY", "Import PLY", "OK"),
+    *("Remove Object", "Export", "Export Splat PLY", "Import PLY", "OK", "Export Reference", "Restore"),
 )
 ALIKE = 0.8  # correlation from which on a label is found
 PATIENCE = 60  # s for a click to show, and for a label to come
@@ -72,6 +72,7 @@ class Mouse:
         done = (lambda: self._find(until) is not None) if isinstance(until, str) else (lambda: until(self.state()))
         start = time.monotonic()
         while not done():
+            self._settle()
             place = self._find(label)
             if place is not None:
                 at = ("mousemove", *map(str, place), "sleep", "0.5", "click", "1", "sleep", "0.5")
@@ -79,7 +80,7 @@ class Mouse:
             elif time.monotonic() - start > PATIENCE:
                 self.shot("lost")
                 sys.exit(f"by_mouse: nothing on the screen reads {label!r}; see {self.out}")
-            self._wait(done, 10)
+            self._wait(done, PATIENCE / 2)
             self._xdotool("mousemove", *VIEW)  # a tooltip may hide what is looked for
         self.shot(label)
 
@@ -107,9 +108,17 @@ class Mouse:
 
     def shot(self, name: str) -> None:
         self._shots += 1
-        time.sleep(3)  # llvmpipe takes its time to draw
+        self._settle()
         clean = "".join(c if c.isalnum() else "_" for c in name)
         save_jpeg(self.out / f"{self._shots:02d}-{clean}.jpg", self.blender.picture())
+
+    def _settle(self) -> None:
+        """Wait until Blender's timer has come in time for two seconds: what was to be drawn anew is on the screen."""
+        start = quiet = time.monotonic()
+        while time.monotonic() - quiet < 2 and time.monotonic() - start < PATIENCE:
+            time.sleep(0.2)
+            if time.time() - (self.blender.share / "state.json").stat().st_mtime > 0.6:
+                quiet = time.monotonic()
 
     def _find(self, label: str) -> tuple[int, int] | None:
         """The middle of a label on the screen, the uppermost one."""
@@ -195,6 +204,30 @@ def by_mouse(mouse: Mouse, case: Case) -> Sequence[float]:
     else:
         mouse.click("Orbit round the Box", lambda s: s["cameras"] > 0)
     mouse.click("Remove Object", lambda s: s["running"] or s["splats"] == 2)
+    late = run(mouse)
+    mouse.wait(lambda s: s["splats"] == 2, PATIENCE)
+    mouse.shot("removed")
+    mouse.click("Export", "Export Splat PLY")
+    exported = mouse.blender.share / "work.ply"
+    mouse.click("Export Splat PLY", lambda _: exported.exists())
+    mouse.click("Restore", lambda s: s["splats"] == 1)
+    export_reference(mouse)
+    return late
+
+
+def export_reference(mouse: Mouse) -> None:
+    """The file browser's button leaves Blender free while the picture is drawn."""
+    (mouse.blender.share / "export_reference").touch()
+    mouse.click("Export Reference", lambda s: s["running"])
+    late = run(mouse)
+    made = [mouse.blender.share / name for name in ("work.png", "work.mask.png")]
+    if not all(m.exists() for m in made):
+        sys.exit("by_mouse: the reference picture and its mask were not written")
+    print(f"by_mouse: while the reference was drawn Blender's timer was late by {max(late):.2f} s (most)", flush=True)
+
+
+def run(mouse: Mouse) -> Sequence[float]:
+    """Wait for a child's end; returns by how many seconds Blender's timer was late meanwhile."""
     late: list[float] = []
 
     def ended(state: dict[str, Any]) -> bool:
@@ -202,11 +235,6 @@ def by_mouse(mouse: Mouse, case: Case) -> Sequence[float]:
         return not state["running"]
 
     mouse.wait(ended, RUN_PATIENCE)
-    mouse.wait(lambda s: s["splats"] == 2, PATIENCE)
-    mouse.shot("removed")
-    mouse.click("Export", "Export Splat PLY")
-    exported = mouse.blender.share / "work.ply"
-    mouse.click("Export Splat PLY", lambda _: exported.exists())
     return late or [0.0]
 
 

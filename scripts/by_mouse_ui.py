@@ -31,6 +31,7 @@ def make_ready() -> Iterator[None]:
     preferences = bpy.context.preferences
     preferences.addons[EXTENSION].preferences.python = os.environ["GIMP3D_PYTHON"]
     bpy.ops.wm.save_userpref()  # the script that comes after finds the extension enabled
+    importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats").MANY = 0  # points: ellipsoids take seconds to draw here
     preferences.view.filebrowser_display_type = "SCREEN"
     bpy.ops.object.select_all(action="SELECT")
     bpy.ops.object.delete()
@@ -71,10 +72,22 @@ def drawn(label: str) -> np.ndarray:
 
 def drop() -> None:
     """What Blender calls when a file is let go over the 3D view; the mouse of X cannot bring one."""
-    area = next(a for a in bpy.context.window.screen.areas if a.type == "VIEW_3D")
-    region = next(r for r in area.regions if r.type == "WINDOW")
-    with bpy.context.temp_override(area=area, region=region):
-        bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=f"{SHARE}/", files=[{"name": "scene.ply"}])
+    bpy.ops.wm.drop_import_file("INVOKE_DEFAULT", directory=f"{SHARE}/", files=[{"name": "scene.ply"}])
+
+
+def export_reference() -> None:
+    """The button of a sub-panel that is closed; the file browser comes."""
+    bpy.ops.gimp3d.export_reference("INVOKE_DEFAULT")
+
+
+def answer(asked: Path) -> None:
+    """Do what the driver asks for by a file of that name, as from the 3D view."""
+    if asked.exists():
+        asked.unlink()
+        area = next(a for a in bpy.context.window.screen.areas if a.type == "VIEW_3D")
+        region = next(r for r in area.regions if r.type == "WINDOW")
+        with bpy.context.temp_override(area=area, region=region):
+            {"drop": drop, "export_reference": export_reference}[asked.name]()
 
 
 def tell() -> None:
@@ -105,9 +118,8 @@ def tick() -> float:
         next(readying)
         wait = 2.0
     except StopIteration:
-        if (SHARE / "drop").exists():
-            (SHARE / "drop").unlink()
-            drop()
+        answer(SHARE / "drop")
+        answer(SHARE / "export_reference")
         tell()
         wait = TICK
     due[0] = time.monotonic() + wait
