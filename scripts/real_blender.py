@@ -20,9 +20,9 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOL = Path(os.environ.get("REAL_BLENDER", ROOT.parent / "shared" / "tools" / "real-blender"))
-DISPLAY, SIZE = ":77", (1500, 1060)
+SIZE = (1500, 1060)  # of the virtual screen
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
-SUITES = {"trixie": "Blender 4.3", "sid": "Blender 5.2 LTS"}
+SUITES = {"trixie": ":77", "sid": ":78"}  # Blender 4.3 and 5.2 LTS, and the virtual screen of each
 PYTHON = "/root/gimp/bin/python"  # inside: runs removals, as no wheel of the extension fits Debian's own
 
 
@@ -32,6 +32,7 @@ class RealBlender:
     def __init__(self, suite: str = "trixie", root: Path | None = None) -> None:
         if not TOOL.exists() or os.geteuid() != 0:
             sys.exit(f"{Path(sys.argv[0]).stem}: a real Blender needs root and {TOOL}; REAL_BLENDER names another tool")
+        self.display = SUITES[suite]
         self.root = (root or ROOT / "build" / f"blender-{suite}").resolve()
         self.share = self.root / "share"
         if not (self.root / "usr" / "bin" / "blender").exists():
@@ -42,7 +43,7 @@ class RealBlender:
 
     def inside(self, *command: str) -> list[str]:
         """The command line that runs a command inside, on the virtual screen."""
-        screen = (f"DISPLAY={DISPLAY}", "LIBGL_ALWAYS_SOFTWARE=1")
+        screen = (f"DISPLAY={self.display}", "LIBGL_ALWAYS_SOFTWARE=1")
         ours = ("GIMP3D_SHARE=/share", f"GIMP3D_PYTHON={PYTHON}", "BLENDER_USER_RESOURCES=/share/user")
         return [str(TOOL), "run", str(self.root), "env", *screen, *ours, *command]
 
@@ -64,7 +65,7 @@ class RealBlender:
     def window(self, script: str) -> Iterator[subprocess.Popen[bytes]]:
         """Blender's process, with its window open and a script of the shared folder running; ended at the end."""
         width, height = map(str, SIZE)
-        xvfb = self.inside("Xvfb", DISPLAY, "-screen", "0", f"{width}x{height}x24", "+extension", "GLX")
+        xvfb = self.inside("Xvfb", self.display, "-screen", "0", f"{width}x{height}x24", "+extension", "GLX")
         blender = self.inside("blender", "--window-geometry", "0", "0", width, height, "--no-window-focus")
         with (self.share / "blender.log").open("w") as log:
             screen = subprocess.Popen(xvfb, stdout=log, stderr=log, start_new_session=True)

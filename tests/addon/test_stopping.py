@@ -96,9 +96,9 @@ def test_a_run_in_the_window_never_blocks_and_ends_with_the_result(splat: bpy.ty
 def test_a_child_gives_way_to_blenders_window() -> None:
     """Else drawing waits for a core: up to 0.5 s with software OpenGL."""
     worker = Worker([], command=[sys.executable, "-c", "input()"])
-    nicer = os.getpriority(os.PRIO_PROCESS, worker._process.pid) - os.getpriority(os.PRIO_PROCESS, 0)
+    child, own = (os.getpriority(os.PRIO_PROCESS, pid) for pid in (worker._process.pid, 0))
     worker.cancel()
-    assert nicer == GIVE_WAY
+    assert child == min(own + GIVE_WAY, 19)  # the most there is
 
 
 def test_escape_leaves_the_scene_as_it_was_within_a_second(splat: bpy.types.Object) -> None:
