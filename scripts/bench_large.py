@@ -14,6 +14,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,8 +76,10 @@ def main() -> None:
     command += ["--images", "none", "--preset", given.preset, "--progress", "none", "--quiet"]
     if given.threads:
         command += ["--threads", str(given.threads)]
+    start = time.perf_counter()
     subprocess.run(command, check=True)
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = used.ru_utime + used.ru_stime
     summary = json.loads((given.out / "summary.json").read_text())
     lines = [
         f"{len(large)} Gaussians, {given.views} views, preset {given.preset}",
@@ -87,7 +90,11 @@ def main() -> None:
     lines += [f"| {s['name']} | {s['seconds']:.1f} |" for s in summary["stages"]]
     rest = summary["seconds_total"] - sum(s["seconds"] for s in summary["stages"])
     lines += [f"| reading, drawing the views, writing | {rest:.1f} |", f"| **all** | {summary['seconds_total']:.1f} |"]
-    lines += ["", f"CPU seconds {used.ru_utime + used.ru_stime:.1f}, peak memory {summary['peak_memory_mb']:.0f} MB"]
+    lines += [
+        "",
+        f"Wall {wall:.1f} s, CPU {cpu:.1f} s ({used.ru_stime / cpu:.0%} in the system), CPU/wall {cpu / wall:.2f}",
+    ]
+    lines += [f"Peak memory {summary['peak_memory_mb']:.0f} MB"]
     (given.out / "large.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
 

@@ -7,16 +7,19 @@ took an eighth of its time for that. An array from here gives its memory back wh
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import threading
 
 import numpy as np
 
 SMALLEST = 1 << 20  # bytes; less than that the allocator keeps by itself
-MOST_KEPT = 512 << 20  # bytes of unused memory
+MOST_KEPT = 256 << 20  # bytes of unused memory
 LINE = 64  # bytes; arrays begin with a cache line, because vectors astride two cost twice
 
+_trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 _lock = threading.RLock()  # re-entrant: the garbage collector may give an array back while one is taken
-_free: dict[int, list[np.ndarray]] = {}
+_free: dict[int, list[np.ndarray]] = {}  # by size, in the order in which they were last given back
 _kept = 0
 
 
@@ -30,10 +33,19 @@ class _Lease:
 
     def __del__(self) -> None:
         global _kept
+        size = self.memory.nbytes
+        if not SMALLEST <= size <= MOST_KEPT:
+            return
         with _lock:
-            if self.memory.nbytes >= SMALLEST and _kept + self.memory.nbytes <= MOST_KEPT:
-                _kept += self.memory.nbytes
-                _free.setdefault(self.memory.nbytes, []).append(self.memory)
+            _free[size] = [*_free.pop(size, ()), self.memory]
+            _kept += size
+            while _kept > MOST_KEPT:  # sizes that were given back longest ago go first
+                stale = next(iter(_free))
+                _kept -= stale
+                if len(_free[stale]) == 1:
+                    del _free[stale]
+                else:
+                    _free[stale].pop()
 
 
 def empty(shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
@@ -47,9 +59,11 @@ def empty(shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
     step = 1 << (size.bit_length() - 4)  # sizes in steps of an eighth or less, so that near ones share
     wanted = -(-size // step) * step + LINE
     with _lock:
-        memory = _free[wanted].pop() if _free.get(wanted) else None
+        memory = _free[wanted].pop() if wanted in _free else None
         if memory is not None:
             _kept -= memory.nbytes
+            if not _free[wanted]:
+                del _free[wanted]
     return np.asarray(_Lease(np.empty(wanted, np.uint8) if memory is None else memory, shape, kind))
 
 
@@ -61,8 +75,13 @@ def zeros(shape: int | tuple[int, ...], dtype: type) -> np.ndarray:
 
 
 def release() -> None:
-    """Give unused memory back to the system."""
+    """Give unused memory back to the system, also what the C library keeps for itself.
+
+    glibc keeps a heap for each thread; what one thread leaves behind there, no other uses.
+    """
     global _kept
     with _lock:
         _free.clear()
         _kept = 0
+    if _trim is not None:
+        _trim(0)

@@ -11,6 +11,7 @@ from typing import Any, Protocol, TypeVar
 import cv2
 import numpy as np
 
+from . import buffers
 from .box import Region
 from .camera import Camera
 from .errors import IllPosed
@@ -18,7 +19,7 @@ from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, drawing, render, surface_depth, touched_window
+from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
@@ -248,6 +249,7 @@ def remove_object(
     open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
+        buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
@@ -273,11 +275,13 @@ def remove_object(
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
+        del painting
         for name, rule in rules.items():
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
         near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
+    buffers.release()
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
@@ -498,17 +502,16 @@ def _appearance(
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
 
-def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
-    """ID → [H, W] bool: where a view may show the Gaussians."""
-    windows = parallel_map(lambda v: window_mask(touched_window(gaussians, v.camera), v.camera), views)
-    return dict(zip((v.camera.id for v in views), windows))
+def _where_drawn(gaussians: Gaussians, views: Sequence[ViewMasks]) -> dict[str, Window]:
+    """By ID, where Gaussians may be seen."""
+    return {v.camera.id: touched_window(gaussians, v.camera) for v in views}
 
 
 def _redrawn(
     painted: dict[str, np.ndarray],
     filled: Gaussians,
     views: Sequence[ViewMasks],
-    touched: dict[str, np.ndarray],  # ID → [H, W] bool, where the last new Gaussians may be
+    touched: dict[str, Window],  # by ID, where the last new Gaussians may be
 ) -> dict[str, np.ndarray]:
     """The painted views, with the filled scene where the removal left a gap that was never to be filled.
 
@@ -517,7 +520,12 @@ def _redrawn(
 
     def redraw(view: ViewMasks) -> np.ndarray:
         picture = painted[view.camera.id]
-        gap = view.silhouette & ~view.target & (view.alpha_after < 0.99) & touched[view.camera.id]
+        gap = (
+            view.silhouette
+            & ~view.target
+            & (view.alpha_after < 0.99)
+            & window_mask(touched[view.camera.id], view.camera)
+        )
         if not gap.any():
             return picture
         return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
@@ -530,13 +538,14 @@ def _all_still_open(
     filled: Gaussians,
     added: int,
     rules: dict[str, np.ndarray],
-    touched: dict[str, np.ndarray],
+    touched: dict[str, Window],
     masks: MaskSettings,
 ) -> tuple[ViewMasks, ...]:
     def left(view: ViewMasks) -> ViewMasks:
         if not view.target.any():
             return view
-        return _still_open(view, filled, added, rules[view.camera.id], touched[view.camera.id], masks)
+        name = view.camera.id
+        return _still_open(view, filled, added, rules[name], window_mask(touched[name], view.camera), masks)
 
     return tuple(parallel_map(left, views))
 

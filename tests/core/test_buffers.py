@@ -81,6 +81,21 @@ def test_no_more_is_kept_than_the_cap(monkeypatch):
     assert buffers._kept == 0 and not buffers._free
 
 
+def test_what_was_not_used_for_longest_goes_first(monkeypatch):
+    monkeypatch.setattr(buffers, "MOST_KEPT", 5 * LARGE)
+    old, new = buffers.empty(LARGE, np.uint8), buffers.empty(2 * LARGE, np.uint8)
+    del old
+    places = [address(new)]
+    del new
+    several = [buffers.empty(2 * LARGE, np.uint8) for _ in range(2)]
+    places += [address(a) for a in several]
+    several.clear()
+    gc.collect()
+    assert list(buffers._free) == [2 * LARGE + buffers.LINE]
+    again = [buffers.empty(2 * LARGE, np.uint8) for _ in range(2)]
+    assert {address(a) for a in again} <= set(places)
+
+
 def test_threads_never_get_the_same_memory_at_once():
     wrong = []
 

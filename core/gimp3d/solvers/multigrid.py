@@ -215,7 +215,7 @@ def _iterate(fine, coarse, work, steepness, target, most):
     return iteration, steepness
 
 
-@kernel
+@inline_kernel
 def _advance(fine, coarse, work, alpha):
     """x ← x + αp, t ← t − αq; the squares of t. b ← what is then left on red pixels, restricted; q is used up."""
     x, t, p, q, b = work.x, work.t, work.p, work.q, work.b
@@ -248,7 +248,7 @@ def _advance(fine, coarse, work, alpha):
     return squares
 
 
-@kernel
+@inline_kernel
 def _descend(coarse, work, g, again):
     """v ← a Jacobi step from zero, or w; w ← its residual, restricted to the next grid's b."""
     b, v, w, steps = work.b, work.v, work.w, coarse.steps
@@ -276,7 +276,7 @@ def _descend(coarse, work, g, again):
                     b[k] = w[f] + half * beside + quarter * corners
 
 
-@kernel
+@inline_kernel
 def _solve_coarsest(coarse, work):
     for i in range(len(coarse.nodes)):
         total = np.float32(0)
@@ -285,7 +285,7 @@ def _solve_coarsest(coarse, work):
         work.w[coarse.nodes[i]] = total
 
 
-@kernel
+@inline_kernel
 def _ascend(coarse, work, g):
     """v ← v + the next grid's w, interpolated; w ← v after a Jacobi step."""
     b, v, w, steps = work.b, work.v, work.w, coarse.steps
@@ -310,7 +310,7 @@ def _ascend(coarse, work, g):
                     w[k] = v[k] + steps[k] * (b[k] - _times(coarse.stencils, v, k, n))
 
 
-@kernel
+@inline_kernel
 def _correct(fine, coarse, work):
     """z ← t after a cycle; the product of t and z in D. q is used up."""
     t, q, z, w = work.t, work.q, work.z, work.w
@@ -339,7 +339,7 @@ def _correct(fine, coarse, work):
     return product
 
 
-@kernel
+@inline_kernel
 def _turn(fine, work, beta):
     """p ← z + βp, q ← A·p / D with red pixels eliminated; the product of p and q in D. z is used up."""
     z, p, q = work.z, work.p, work.q

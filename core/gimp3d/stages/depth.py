@@ -49,7 +49,8 @@ def complete_depth(
 
     Evidence clearly behind a surface that no view sees past is seen from under that surface, and dropped. A completed
     surface that views do see past is pushed back along its rays to where they do not. What is contradicted even then
-    is counted and has low confidence.
+    is counted and has low confidence. Round the hole, pixels whose depth falls through a surface that other views agree
+    on are not trusted: scans have leaks.
 
     Raises
     ------
@@ -57,10 +58,14 @@ def complete_depth(
         As `complete_disparity`.
     """
     known = without_front(disparity, known, view.target, view.occluder, settings.layers)
-    relative = None if prior is None else relative_disparity(prior, disparity, known)
-    evidence = gather_depth_evidence(view, views, settings.evidence)
     ring = known & (distance_to(view.target) <= settings.planes.ring)
-    space = free_space(view, views, ring, settings.evidence)
+    measured = gather_depth_evidence(view, views, settings.evidence, ring)
+    fallen = ring & (disparity < (1 - settings.evidence.agreement) * measured.disparity)
+    mostly = replace(settings.layers, front_share=0.5)
+    known = without_front(disparity, known, view.target, fallen, mostly) & ~fallen
+    evidence = _without(measured, ~view.target)
+    relative = None if prior is None else relative_disparity(prior, disparity, known)
+    space = free_space(view, views, ring & known, settings.evidence)
 
     def complete(evidence: DepthEvidence | None) -> DepthCompletion:
         return complete_disparity(disparity, known, view.target, relative, settings, evidence)

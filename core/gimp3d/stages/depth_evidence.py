@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
+from ..jit import exact_kernel
 from ..threads import parallel_map
 from .layers import steps
 from .masks import ViewMasks
@@ -44,6 +45,7 @@ def gather_depth_evidence(
     view: ViewMasks,  # the reference
     views: Sequence[ViewMasks],  # the others; the reference among them does not count
     settings: DepthEvidenceSettings = DepthEvidenceSettings(),
+    ring: np.ndarray | None = None,  # [H, W] bool, pixels off the hole that are asked about too
 ) -> DepthEvidence:
     """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
 
@@ -52,7 +54,8 @@ def gather_depth_evidence(
     views gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
     """
     others = [v for v in views if v.camera.id != view.camera.id]
-    samples = parallel_map(lambda v: _samples(v, view, settings), others)
+    asked = view.target if ring is None else view.target | ring
+    samples = parallel_map(lambda v: _samples(v, view, asked, settings), others)
     h, w = view.target.shape
     found, count = np.zeros(h * w), np.zeros(h * w)
     pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
@@ -75,16 +78,17 @@ def gather_depth_evidence(
     return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
 
 
-def _samples(other: ViewMasks, view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
-    """[2, M]: pixels of the reference's hole (flat indices) and the disparities that a view measured there."""
+def _samples(other: ViewMasks, view: ViewMasks, asked: np.ndarray, settings: DepthEvidenceSettings) -> np.ndarray:
+    """[2, M]: pixels asked about in the reference (flat indices) and the disparities that a view measured there."""
     width = view.target.shape[1]
     rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))
     points = other.camera.unproject(
         np.stack([cols + 0.5, rows + 0.5], -1), other.depth_before[rows, cols].astype(float)
     )
     _, cols, rows, z = _framed(view.camera, points)
-    front = view.depth_before[rows, cols]  # nothing of the background lies before what the reference itself sees
-    there = view.target[rows, cols] & (z > (1 - settings.beyond) * front)
+    # Nothing that the object hides lies before the object itself.
+    front = np.where(view.target, (1 - settings.beyond) * view.depth_before, 0)[rows, cols]
+    there = asked[rows, cols] & (z > front)
     return np.stack([rows[there] * width + cols[there], 1 / z[there]])
 
 
@@ -130,7 +134,7 @@ class FreeSpace:
     """Where views see through: no surface of the background can stand there."""
 
     view: ViewMasks  # the reference
-    others: tuple[tuple[Camera, np.ndarray, np.ndarray], ...]  # camera, nearest and farthest z round each pixel
+    others: tuple[ViewMasks, ...]
     margin: int  # views by which those that see past must outnumber those that see a surface
     settings: DepthEvidenceSettings
 
@@ -175,9 +179,10 @@ class FreeSpace:
         uv = np.stack([cols + 0.5, rows + 0.5], -1)
         points = self.view.camera.unproject(uv, depth[rows, cols].astype(np.float64))
         past, there = np.zeros(len(points), int), np.zeros(len(points), int)
-        for camera, nearest, farthest in self.others:
-            index, x, y, z = _framed(camera, points)
-            near, far = nearest[y, x], farthest[y, x]
+        for other in self.others:
+            index, x, y, z = _framed(other.camera, points)
+            near, far = np.empty((2, len(index)), np.float32)
+            _extremes(np.ascontiguousarray(other.depth_before), x, y, near, far)
             past[index] += near > (1 + self.settings.beyond) * z
             there[index] += (near <= (1 + self.settings.beyond) * z) & (far >= (1 - self.settings.beyond) * z)
         return past, past - there
@@ -193,15 +198,20 @@ def free_space(
 
     In scans with poor depths, views "see past" tables; they must then say so more clearly of the hole than of these.
     """
-    around = np.ones((3, 3), np.uint8)
-    others = tuple(
-        (v.camera, cv2.erode(v.depth_before, around), cv2.dilate(v.depth_before, around))  # nearest 0: void is near
-        for v in views
-        if v.camera.id != view.camera.id
-    )
-    space = FreeSpace(view, others, 0, settings)
+    space = FreeSpace(view, tuple(v for v in views if v.camera.id != view.camera.id), 0, settings)
     rows, cols = np.nonzero(trusted & (view.depth_after > 0))
     if len(rows) == 0:
         return space
     excess = space._votes(view.depth_after, rows, cols)[1]
     return replace(space, margin=max(0, int(np.percentile(excess, 95))))
+
+
+@exact_kernel
+def _extremes(depth, cols, rows, near, far):
+    """The least z (0: void is near) and the greatest within a pixel of each (col, row)."""
+    height, width = depth.shape
+    for i in range(len(rows)):
+        near[i] = far[i] = depth[rows[i], cols[i]]
+        for v in range(max(0, rows[i] - 1), min(height, rows[i] + 2)):
+            for u in range(max(0, cols[i] - 1), min(width, cols[i] + 2)):
+                near[i], far[i] = min(near[i], depth[v, u]), max(far[i], depth[v, u])

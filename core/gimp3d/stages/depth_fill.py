@@ -27,6 +27,7 @@ class DepthSettings:
     layers: LayerSettings = LayerSettings()
     evidence: DepthEvidenceSettings = DepthEvidenceSettings()
     plane_share: float = 0.65  # of the ring that must lie on planes
+    tolerances: tuple[float, ...] = (1.0, 2.0, 4.0)  # of planes.inlier, tried until so much does
     plane_trust: float = 1.1  # planes are taken if they miss a withheld band by this many times a plate's miss
     smoothing: float = 12.0  # σ of the average of what the ring deviates from a plane
     skin: float = 1.5  # width of the part of the ring next to the hole that the object's haze bends
@@ -119,17 +120,24 @@ def choose_plan(
     plain = Plan(_layers(around, (), kind == "smooth", settings), kind, words)
     if settings.surface not in ("auto", "planar") or not around.touching.any():
         return plain
-    planar = planar_surfaces(around.disparity, around.measured, around.distance, settings.planes)
-    if planar.share < settings.plane_share:
-        if settings.surface == "planar" and insist:
-            raise IllPosed(f"depth: only {planar.share:.0%} of the surroundings lie on planes; use --depth-prior auto")
-        return plain
-    planes = Plan(_layers(around, planar.surfaces, True, settings), kind, planar.reason)
-    if settings.surface == "planar":
-        return planes
-    on_planes = np.any([layer.on for layer in planes.layers if layer.surface is not None], axis=0)
-    misses = [withheld_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
-    return plain if misses[0] > settings.plane_trust * misses[1] else planes
+    share = 0.0
+    for tolerance in settings.tolerances:  # a rough scan's table is a plane too, and its lesser steps are noise
+        own = replace(settings.planes, inlier=tolerance * settings.planes.inlier)
+        planar = planar_surfaces(around.disparity, around.measured, around.distance, own)
+        share = max(share, planar.share)
+        if planar.share < settings.plane_share:
+            continue
+        rough = replace(settings, layers=replace(settings.layers, step=tolerance * settings.layers.step))
+        planes = Plan(_layers(around, planar.surfaces, True, rough), kind, planar.reason)
+        if settings.surface == "planar":
+            return planes
+        on_planes = np.any([layer.on for layer in planes.layers if layer.surface is not None], axis=0)
+        misses = [withheld_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
+        if not misses[0] > settings.plane_trust * misses[1]:
+            return planes
+    if settings.surface == "planar" and insist:
+        raise IllPosed(f"depth: only {share:.0%} of the surroundings lie on planes; use --depth-prior auto")
+    return plain
 
 
 def _layers(

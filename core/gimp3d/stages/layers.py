@@ -89,12 +89,12 @@ def without_front(
     disparity: np.ndarray,  # [H, W]
     known: np.ndarray,  # [H, W] bool
     hole: np.ndarray,  # [H, W] bool
-    front: np.ndarray,  # [H, W] bool, pixels seen to lie in front of the object, at its outline
+    front: np.ndarray,  # [H, W] bool, pixels seen to lie in front of the object, at its outline; or wrong
     settings: LayerSettings = LayerSettings(),
 ) -> np.ndarray:
     """[H, W] bool: the known pixels without the surfaces that hide the object itself: they bound nothing behind it.
 
-    A part of the ring, cut at steps, goes if enough of it is front.
+    Likewise without surfaces that are not there. A part of the ring, cut at steps, goes if enough of it is front.
     """
     if not (front & known).any():
         return known

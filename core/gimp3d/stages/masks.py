@@ -70,8 +70,12 @@ class MaskSettings:
     occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
     infinity: float = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
+    least_border: float = (
+        0.25  # and times `around` and the root of what the object covers of it: leaks have a narrow rim
+    )
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
+    usual_agreement: float = 0.97  # share of surface that two views of a good scan place alike
     least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
     least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
     selection: SelectionSettings = SelectionSettings()
@@ -81,7 +85,7 @@ class MaskSettings:
 class ViewMasks:
     """What a view shows before and after the removal; all arrays [H, W] of the view.
 
-    Hundreds of these are held at once, so all but `depth_before` and `alpha_after` are kept small and made anew each
+    Hundreds of these are held at once, so all but `depth_before` and `alpha_before` are kept small and made anew each
     time they are read.
     """
 
@@ -91,6 +95,7 @@ class ViewMasks:
     occluder: np.ndarray  # bool, kept surfaces in front of the object, at its outline
     target: np.ndarray  # bool, T: the pixels to fill
     depth_before: np.ndarray  # float32 z of the scene with the object, 0 = nothing, or nothing to be trusted
+    alpha_before: np.ndarray  # float32
     depth_after: np.ndarray  # float32 z without it
     alpha_after: np.ndarray  # float32
 
@@ -109,30 +114,29 @@ class _Bits:
         return np.unpackbits(bits, axis=1, count=width).view(bool)
 
 
-class _LikeBefore:
-    """A field of ViewMasks that is a depth map: only the rectangle is kept in which it is not `depth_before`."""
+class _Like:
+    """A field of ViewMasks that is mostly as another one: only the rectangle is kept in which it is not."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, base: str) -> None:
+        self.name, self.base = name, base
 
-    def __set__(self, view: ViewMasks, depth: np.ndarray) -> None:
-        other = depth != view.depth_before
+    def __set__(self, view: ViewMasks, picture: np.ndarray) -> None:
+        other = picture != getattr(view, self.base)
         rows, cols = np.flatnonzero(other.any(1)), np.flatnonzero(other.any(0))
         window = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] if len(rows) else np.s_[:0, :0]
-        view.__dict__[self.name] = window, depth[window].copy()
+        view.__dict__[self.name] = window, picture[window].copy()
 
     def __get__(self, view: ViewMasks, owner: type) -> np.ndarray:
         window, values = view.__dict__[self.name]
-        depth = view.depth_before.copy()
-        depth[window] = values
-        return depth
+        picture = getattr(view, self.base).copy()
+        picture[window] = values
+        return picture
 
 
-for _name, _kept in (
-    *((n, _Bits) for n in ("polygon", "silhouette", "occluder", "target")),
-    ("depth_after", _LikeBefore),
-):
-    setattr(ViewMasks, _name, _kept(_name))
+for _name in ("polygon", "silhouette", "occluder", "target"):
+    setattr(ViewMasks, _name, _Bits(_name))
+for _what in ("depth", "alpha"):
+    setattr(ViewMasks, f"{_what}_after", _Like(f"{_what}_after", f"{_what}_before"))
 
 
 @dataclass(frozen=True)
@@ -196,14 +200,18 @@ def find_masks(
         )
     passes = _Passes(progress, 3 * len(seeing))
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
+    agreement = depth_agreement(seeing, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance)
     selection = by_centre(inside)
     if not settings.selection.by_centre:
-        selection, before = _choose(gaussians, region, before, passes, settings.selection)
+        # Where views disagree on what they see, trainers have left that much more smears behind the object.
+        lacking = max(0.0, settings.usual_agreement - agreement)
+        rough = replace(settings.selection, support=settings.selection.support and settings.selection.support + lacking)
+        selection, before = _choose(gaussians, region, before, passes, rough)
     gone = gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, gone, selection.removed, b, settings), before)
     centre = np.mean([box.center for box in region], axis=0)
     sight = Sight.make([(b.camera, b.depth, _untrusted(b, a, settings)) for b, a in zip(before, after)], centre)
-    mode, warnings = settings.mode, _inconsistencies(before, settings) if settings.mode == "need" else ()
+    mode, warnings = settings.mode, _inconsistencies(before, agreement, settings) if settings.mode == "need" else ()
     if warnings:
         mode = "paper"
 
@@ -222,13 +230,9 @@ def find_masks(
     return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), warnings)
 
 
-def _inconsistencies(before: Sequence[_Before], settings: MaskSettings) -> tuple[str, ...]:
+def _inconsistencies(before: Sequence[_Before], agreement: float, settings: MaskSettings) -> tuple[str, ...]:
     """Why what one view shows says nothing about the others, in words."""
     instead = "every pixel of the box's outline is filled (mode paper)"
-    cameras = [b.camera for b in before]
-    agreement = depth_agreement(
-        cameras, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance
-    )
     likeness = [b.likeness for b in before if np.isfinite(b.likeness)]
     found = []
     if agreement < settings.least_agreement:
@@ -442,7 +446,7 @@ def _polygon_pixels(view: _Before) -> np.ndarray:
 def _view_masks(
     before: _Before, after: _After, needed: np.ndarray, consistent: bool, settings: MaskSettings
 ) -> ViewMasks:
-    window, depth, alpha = after.window, before.depth, before.alpha
+    window, depth = after.window, before.depth
     silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
     silhouette[window] = after.weight > settings.changed
     if consistent:  # else depths say nothing
@@ -451,10 +455,18 @@ def _view_masks(
     target = needed & ~occluder & (silhouette | ~beside)  # beside what is in front T must not outgrow the object
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
-    depth_after, alpha_after = before.depth.copy(), alpha
-    depth_after[window], alpha_after[window] = after.depth, after.alpha  # of alpha, what was before is not needed
+    depth_after, alpha_after = before.depth.copy(), before.alpha.copy()
+    depth_after[window], alpha_after[window] = after.depth, after.alpha
     return ViewMasks(
-        before.camera, _polygon_pixels(before), silhouette, occluder, target, depth, depth_after, alpha_after
+        before.camera,
+        _polygon_pixels(before),
+        silhouette,
+        occluder,
+        target,
+        depth,
+        before.alpha,
+        depth_after,
+        alpha_after,
     )
 
 
@@ -487,7 +499,8 @@ def _continues_outside(
     """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
-    by other views past the table's edge, but it is not what was behind the object.
+    by other views past the table's edge, but it is not what was behind the object. Tables of rough scans leak beside
+    the object too, but little, for all that shows behind it.
     """
     z, void = depth, alpha < settings.void
     there = (z > 0) & (alpha >= settings.solid) | void
@@ -503,7 +516,9 @@ def _continues_outside(
     count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
     surface = surface.reshape(z.shape)
     outside = np.bincount(surface[there & ~touched], minlength=count)
-    return there & (outside[surface] >= settings.least_outside)
+    covered = np.bincount(surface[there & touched], minlength=count)
+    enough = np.maximum(settings.least_outside, settings.least_border * settings.around * np.sqrt(covered))
+    return there & (outside >= enough)[surface]
 
 
 def sees(

@@ -3,6 +3,11 @@ against closed forms."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pyamg
 import pytest
@@ -538,3 +543,21 @@ def test_a_part_with_gaps_in_its_guidance_and_no_rim_is_continued_from_the_guida
     gap = np.isnan(guidance)
     np.testing.assert_array_equal(solution.values[~gap], guidance[~gap])
     np.testing.assert_allclose(solution.values[gap], reference(gap, ~gap, guidance)[gap], atol=1e-8)
+
+
+ONCE = """
+import hashlib, numpy as np
+from gimp3d.solvers.poisson import solve_poisson
+rows, cols = np.mgrid[:120, :150]
+hole = np.hypot(rows - 60, cols - 75) < 45
+picture = np.random.default_rng(0).random(hole.shape)
+print(hashlib.sha256(solve_poisson(hole, ~hole, picture).values.tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_the_run_that_compiles_solves_as_those_that_load(tmp_path: Path) -> None:
+    """A kernel that calls another, not inlined, runs that one's own code where both were compiled, else its copy."""
+    environment = {**os.environ, "GIMP3D_CACHE": str(tmp_path)}
+    runs = [subprocess.run([sys.executable, "-c", ONCE], env=environment, capture_output=True) for _ in range(2)]
+    assert runs[0].returncode == 0 and runs[0].stdout == runs[1].stdout

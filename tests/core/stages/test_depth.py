@@ -88,6 +88,33 @@ def test_rough_ground_is_continued_smoothly():
         complete(rough, blob(), settings=PLANAR)
 
 
+def rough_scan(seed):
+    """Depths of scans are off by patches."""
+    patches = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((H, W)), (0, 0), 2)
+    return FLOOR * (1 + 0.035 * patches / patches.std())
+
+
+def test_the_table_of_a_rough_scan_is_a_plane_all_the_same():
+    """A plate leads what is wrong into the hole as humps."""
+    hole, planar, plate = blob(), [], []
+    for seed in range(6):
+        found = complete(rough_scan(seed), hole)
+        assert found.reason.startswith("planar")
+        planar.append(np.median(relative_error(found, FLOOR, hole)))
+        smooth = complete(rough_scan(seed), hole, settings=SMOOTH)
+        plate.append(np.median(relative_error(smooth, FLOOR, hole)))
+    assert np.mean(planar) < 0.5 * np.mean(plate)
+
+
+def test_a_lesser_step_in_a_rough_scan_is_noise():
+    """A patch beside the hole that lies 9 % lower is a layer of its own on smooth ground only."""
+    hole, lower = blob(), np.where((U > 70) & (U < 95) & (V < 50), 0.91, 1.0)
+    found = complete(rough_scan(0) * lower, hole)
+    assert np.percentile(relative_error(found, FLOOR, hole), 95) < 0.05
+    smooth = complete(FLOOR * lower, hole)
+    assert np.percentile(relative_error(smooth, FLOOR, hole), 95) > 0.08
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_curved_ground_keeps_its_slope(seed):
     """A membrane forgets the slope at the rim, and planes are wrong: the plate is taken, and better than both."""

@@ -65,7 +65,7 @@ def view_of(camera, height):
     alpha = (after > 0).astype(np.float32)
     none = np.zeros_like(silhouette)
     target = silhouette & (after > 0)
-    return ViewMasks(camera, silhouette, silhouette, none, target, np.where(hit, ball, after), after, alpha)
+    return ViewMasks(camera, silhouette, silhouette, none, target, np.where(hit, ball, after), alpha, after, alpha)
 
 
 @pytest.fixture(scope="module", params=[floor, mound], ids=["floor", "mound"])
@@ -186,11 +186,11 @@ def test_what_shows_from_under_a_table_is_no_evidence():
     ball = sphere_depth(CAMERAS[0])
     before = np.where((ball > 0) & (ball < whole), ball, whole)
     alpha, none = np.ones_like(whole), np.zeros_like(gap)
-    view = ViewMasks(CAMERAS[0], gap, gap, none, gap, before, after, alpha)
+    view = ViewMasks(CAMERAS[0], gap, gap, none, gap, before, alpha, after, alpha)
     others = []
     for camera in low:
         _, ground, _ = table(camera)
-        others.append(ViewMasks(camera, none, none, none, none, ground, ground, alpha))
+        others.append(ViewMasks(camera, none, none, none, none, ground, alpha, ground, alpha))
     known = ~gap & (after > 0)
     assert (gather_depth_evidence(view, others).weight > 0).sum() > 0.1 * gap.sum()  # the trap is there
     found = complete_depth(view, [view, *others], 1 / np.maximum(after, 1e-3), known)
@@ -214,3 +214,28 @@ def test_remains_of_the_object_are_no_evidence():
     disparity = np.divide(1, view.depth_after, out=np.zeros_like(view.depth_after), where=view.depth_after > 0)
     found = complete_depth(view, [view, *spoilt[1:]], disparity, known, None, DepthSettings(surface="smooth"))
     assert np.abs(found.depth[view.target] / view.depth_after[view.target] - 1).max() < 0.03
+
+
+def test_what_falls_through_a_surface_round_the_hole_is_not_continued():
+    """A scan's floor leaks: in one view it shows what lies far below. Others see the floor there."""
+    views = [view_of(c, floor) for c in CAMERAS]
+    rows, cols = np.nonzero(views[0].target)
+    leak = ~views[0].target & (np.arange(160) > cols.mean() - 5) & (np.arange(120)[:, None] > rows.mean())
+    leaking = [np.where(leak, 2 * d, d).astype(np.float32) for d in (views[0].depth_before, views[0].depth_after)]
+    view = dataclasses.replace(views[0], depth_before=leaking[0], depth_after=leaking[1])
+    disparity = np.divide(1, view.depth_after, out=np.zeros_like(view.depth_after), where=view.depth_after > 0)
+    known = ~view.target & (view.depth_after > 0)
+
+    def beside(other):
+        """A view that saw nothing of the hole itself."""
+        points = other.camera.unproject(other.camera.pixel_centres(), other.depth_before)
+        uv, _ = view.camera.project(points)
+        cols, rows = np.clip(np.nan_to_num(uv), 0, [159, 119]).astype(int).transpose(2, 0, 1)
+        return dataclasses.replace(other, depth_before=np.where(view.target[rows, cols], 0, other.depth_before))
+
+    def worst(others):
+        depth = complete_depth(view, others, disparity, known).depth
+        return np.percentile(np.abs(depth[view.target] / views[0].depth_after[view.target] - 1), 95)
+
+    assert worst([view]) > 0.2  # the trap is there
+    assert worst([view, *map(beside, views[1:])]) < 0.02

@@ -20,6 +20,7 @@ def view() -> ViewMasks:
         np.zeros(SHAPE, bool),
         silhouette,
         depth,
+        np.ones(SHAPE, np.float32),
         depth,
         np.ones(SHAPE, np.float32),
     )

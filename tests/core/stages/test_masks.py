@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
 import cv2
@@ -25,8 +25,8 @@ from gimp3d.raster.backend import CpuBackend
 from gimp3d.raster.cpu_drawing import CpuDrawing
 from gimp3d.stages import masks as stage
 from gimp3d.stages import selection
-from gimp3d.stages.masks import MaskSettings, find_masks, sees
-from gimp3d.stages.selection import Fate
+from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks, sees
+from gimp3d.stages.selection import Fate, SelectionSettings
 from gimp3d.threads import set_thread_count
 
 RIM = np.ones((3, 3), np.uint8)  # a 1-px rim on every side
@@ -195,6 +195,36 @@ def test_views_that_do_not_fit_fall_back_to_the_papers_targets(monkeypatch: pyte
     assert vague.mode == "paper" and "alike" in vague.warnings[0] and vague.hole_pixels > 0.9 * paper.hole_pixels
 
 
+@pytest.mark.parametrize("resolution", [1, 4])
+def test_what_leaks_beside_the_object_does_not_go_on_behind_it(resolution: int) -> None:
+    """Behind an object on a table: a far wall, seen past the table's edge, or the ground through a leak."""
+    rows, cols = np.mgrid[: 120 * resolution, : 120 * resolution] // resolution
+    touched = np.hypot(rows - 60, cols - 60) < 30
+    wall, leak = rows < 60, touched & (rows < 60) | (np.abs(cols - 60) < 3) & (np.abs(rows - 32) < 8)
+    for far, goes_on in ((wall, True), (leak, False)):
+        depth = np.where(far, 9.0, 2.0).astype(np.float32)
+        found = stage._continues_outside(depth, np.ones_like(depth), touched, 2.0, MaskSettings())
+        assert (found[touched & far] == goes_on).all() and found[~far].all()
+
+
+@pytest.mark.parametrize(("agreement", "support"), [(1.0, 0.05), (0.97, 0.05), (0.77, 0.25)])
+def test_the_worse_views_agree_the_more_photos_must_vouch_for_what_is_revealed(
+    monkeypatch: pytest.MonkeyPatch, agreement: float, support: float
+) -> None:
+    asked = []
+
+    def choose(*given: object) -> object:
+        asked.append(given[-1])
+        return chosen(*given)
+
+    chosen = stage._choose
+    monkeypatch.setattr(stage, "_choose", choose)
+    monkeypatch.setattr(stage, "depth_agreement", lambda *_: agreement)
+    find_masks(scene(), REGION, cameras())
+    find_masks(scene(), REGION, cameras(), MaskSettings(selection=SelectionSettings(support=0)))
+    assert [a.support for a in asked] == pytest.approx([support, 0])
+
+
 def test_constant_photos_say_nothing() -> None:
     views = cameras()
     grey = {c.id: np.full((c.height, c.width, 3), 128, np.uint8) for c in views}
@@ -317,3 +347,24 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
     assert area <= most * unseen
     assert touched >= 0.84 * either
     assert scale < 1 or masks.selection.count(Fate.KEPT_SURFACE) > 100
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 20), st.integers(1, 20))
+def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: int) -> None:
+    rng = np.random.default_rng(seed)
+    bits = rng.random((4, height, width)) < 0.3
+    before = rng.random((2, height, width), np.float32)
+    after = np.where(rng.random((2, height, width)) < 0.1, rng.random((2, height, width)), before).astype(np.float32)
+    view = ViewMasks(cameras()[0], *bits, *before, *after)
+    for name, expected in zip(("polygon", "silhouette", "occluder", "target"), bits):
+        found = getattr(view, name)
+        assert found.dtype == bool and (found == expected).all()
+    assert view.depth_after.dtype == view.alpha_after.dtype == np.float32
+    assert (view.depth_after == after[0]).all() and (view.alpha_after == after[1]).all()
+    other = replace(view, target=~bits[3], depth_after=before[0])
+    assert (other.target == ~bits[3]).all() and (other.depth_after == before[0]).all()
+    assert other.depth_before is view.depth_before and other.alpha_before is view.alpha_before
+    assert (view.depth_after == after[0]).all()
+    with pytest.raises(FrozenInstanceError):
+        view.target = bits[0]  # type: ignore[misc]

@@ -31,6 +31,7 @@ from gimp3d.stages.propagate import (
     ViewToPaint,
     blend_band,
     blend_rim,
+    near_hole,
     propagate,
     smooth_depth,
 )
@@ -145,6 +146,20 @@ def test_the_number_of_threads_does_not_matter(reference: Reference, transfer: s
         set_thread_count(None)
     for a, b in zip(*(r.views for r in results)):
         assert (a.image == b.image).all() and (a.raw == b.raw).all() and (a.rules == b.rules).all()
+
+
+@pytest.mark.parametrize("settings_", [PropagateSettings(), SAMPLE])
+def test_the_new_surface_is_asked_for_near_the_hole_only(reference: Reference, settings_: PropagateSettings) -> None:
+    target = view(reference, 2)
+    unknown = np.full_like(target.depth_new, 0.3)
+    unknown[near_hole(target.target, settings_)] = target.depth_new[near_hole(target.target, settings_)]
+    assert (unknown != target.depth_new).any()
+    whole_, part = (paint(reference, v, settings_)[0] for v in (target, replace(target, depth_new=unknown)))
+    for name in ("image", "raw", "rules", "depth"):
+        np.testing.assert_array_equal(getattr(whole_, name), getattr(part, name))
+    h, w = part.rules.shape
+    there = np.s_[part.top : part.top + h, part.left : part.left + w]
+    np.testing.assert_array_equal(part.depth, target.depth_new[there])
 
 
 def test_views_are_let_go_once_they_are_painted(reference: Reference) -> None:

@@ -16,6 +16,8 @@ from gimp3d.raster import render
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.reference import (
     EvidenceSettings,
+    ReferenceSettings,
+    _coarse,
     choose_reference,
     facing,
     gather_evidence,
@@ -66,6 +68,24 @@ def test_the_needed_surface_is_the_floor_under_the_object() -> None:
     assert np.percentile(np.abs(surface.points[:, 2]), 90) < 0.05  # the floor lies at z = 0
     assert np.median(surface.normals[:, 2]) > 0.95
     assert np.abs(surface.points[:, :2]).max() < 2
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_a_coarse_view_shows_the_same_points(step: int) -> None:
+    view = find_masks(scene(), REGION, cameras()).views[0]
+    camera, part = _coarse(view, step)
+    depth = view.depth_before.astype(np.float64)
+    points = view.camera.unproject(view.camera.pixel_centres(), depth)[part]
+    np.testing.assert_allclose(camera.unproject(camera.pixel_centres(), depth[part]), points, atol=1e-9)
+    assert view.target[part].sum() > 0.8 * view.target.sum() / step**2
+
+
+def test_large_holes_are_sampled_as_well_as_small_ones() -> None:
+    views = find_masks(scene(), REGION, cameras()).views
+    fine, coarse = (needed_surface(views, settings=ReferenceSettings(samples=n)) for n in (10**6, 50))
+    assert 0 < len(coarse.points) < 0.5 * len(fine.points)
+    apart = np.linalg.norm(fine.points[:, None] - coarse.points[None], axis=-1)
+    assert apart.min(1).max() < 0.15 and apart.min(0).max() < 0.1  # one surface, and all of it
 
 
 def test_a_wanted_view_is_taken_unless_it_does_not_see_the_hole() -> None:

@@ -133,6 +133,19 @@ def test_seeds_are_legal_thin_and_lie_in_the_surface(surfels: bool) -> None:
         assert (seeds.scales[:, 2] < 0.2 * seeds.scales[:, :2].min(1)).all()
 
 
+def test_seeds_do_not_depend_on_what_lies_round_the_target() -> None:
+    camera = cameras(9)[1]
+    image, depth = render_bytes(truth(), camera), render(truth(), camera).median_depth
+    target = np.zeros(depth.shape, bool)
+    target[30:60, 40:80] = depth[30:60, 40:80] > 0
+    beyond = ((12, 8), (16, 4))
+    larger = replace(camera, width=140, height=110, cx=camera.cx + 16, cy=camera.cy + 12)
+    pictures = np.pad(image, (*beyond, (0, 0)), constant_values=9), np.pad(depth, beyond), np.pad(target, beyond)
+    found = seed_gaussians(camera, image, depth, target, False), seed_gaussians(larger, *pictures, False)
+    for name in ("means", "log_scales", "quats", "sh"):
+        np.testing.assert_allclose(*(getattr(g, name) for g in found), atol=1e-5)
+
+
 def test_pixels_without_depth_make_no_gaussian() -> None:
     camera = cameras(9)[1]
     image = np.zeros((90, 120, 3), np.uint8)
