@@ -324,6 +324,18 @@ def test_every_view_is_drawn_a_fixed_number_of_times(monkeypatch: pytest.MonkeyP
     assert per_view[0] == per_view[1] <= 4
 
 
+def test_only_a_part_is_drawn_without_the_object_but_all_of_the_view_is_right() -> None:
+    views = cameras(5)
+    found = find_masks(scene(), REGION, views)
+    kept = scene().take(~found.removed)
+    for view in found.views:
+        depth, alpha = surface_depth(kept, view.camera)
+        np.testing.assert_array_equal(view.depth_after, depth)
+        np.testing.assert_array_equal(view.alpha_after, alpha)
+        before, _ = surface_depth(scene(), view.camera)
+        np.testing.assert_array_equal(view.depth_before, before)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["desk", "corner", "gloss", "rocks"])
 @pytest.mark.parametrize(("scale", "least", "most"), [(1.0, 0.99, 1.6), (0.8, 0.8, 1.6), (1.2, 0.99, 1.75)])
