@@ -228,14 +228,8 @@ def export_reference(mouse: Mouse) -> None:
 
 def run(mouse: Mouse) -> Sequence[float]:
     """Wait for a child's end; returns by how many seconds Blender's timer was late meanwhile."""
-    late: list[float] = []
-
-    def ended(state: dict[str, Any]) -> bool:
-        late[:] = state["late"] if state["running"] else late
-        return not state["running"]
-
-    mouse.wait(ended, RUN_PATIENCE)
-    return late or [0.0]
+    mouse.wait(lambda s: not s["running"], RUN_PATIENCE)
+    return mouse.state()["late"] or [0.0]
 
 
 def by_command(blender: RealBlender, case: Case) -> None:

@@ -90,37 +90,41 @@ def answer(asked: Path) -> None:
             {"drop": drop, "export_reference": export_reference}[asked.name]()
 
 
-def tell() -> None:
+def tell(lateness: float) -> None:
     base = importlib.import_module(f"{EXTENSION}.gimp3d_addon.operators.base")
     splats = importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats")
-    settings = bpy.context.scene.gimp3d
+    running = base.RunsChild.running is not None
+    if running and was_running.pop():
+        late.append(round(lateness, 3))
+    elif running:  # just begun: the scene was handed over
+        late.clear()
+    was_running[:] = [running]
     state = {
         "splats": sum(splats.is_splat(o) for o in bpy.data.objects),
-        "boxes": [[*r.object.location, *r.object.scale] for r in settings.rois],
+        "boxes": [[*r.object.location, *r.object.scale] for r in bpy.context.scene.gimp3d.rois],
         "cameras": sum(o.type == "CAMERA" for o in bpy.context.scene.objects),
-        "running": base.RunsChild.running is not None,
-        "late": sorted(late),
+        "running": running,
+        "late": late,
     }
     (SHARE / "state.new").write_text(json.dumps(state))
     (SHARE / "state.new").rename(SHARE / "state.json")
-    if not state["running"]:
-        late.clear()
 
 
 readying = make_ready()
-late: list[float] = []  # s that each timer call of a run came after its time: how long Blender was busy
+late: list[float] = []  # s that each timer call of the last run came after its time: how long Blender was busy
+was_running = [False]
 due = [time.monotonic()]
 
 
 def tick() -> float:
-    late.append(round(max(0.0, time.monotonic() - due[0]), 3))
+    lateness = max(0.0, time.monotonic() - due[0])
     try:
         next(readying)
         wait = 2.0
     except StopIteration:
         answer(SHARE / "drop")
         answer(SHARE / "export_reference")
-        tell()
+        tell(lateness)
         wait = TICK
     due[0] = time.monotonic() + wait
     return wait
