@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Protocol, TypeVar
 
 import cv2
@@ -39,12 +39,14 @@ from .stages.propagate import (
 )
 from .stages.reference import (
     EvidenceSettings,
+    NeededSurface,
     ReferenceChoice,
     ReferenceSettings,
     ViewScore,
     choose_reference,
     disparity_of,
     gather_evidence,
+    needed_surface,
     rim,
 )
 from .stages.refine import (
@@ -247,6 +249,7 @@ def remove_object(
     levelled = {name: e.image for name, e in exposures.items()}
     filled, added = kept, None
     open_views = masks.views
+    surface = cache(partial(needed_surface, masks.views, settings.masks.solid, settings.reference))
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     for round_ in range(1 + settings.extra_references):
         buffers.release()  # a stage's leavings are of little use to the next
@@ -259,6 +262,7 @@ def remove_object(
                 "" if first else f" {round_ + 1}",
                 filled,
                 open_views,
+                surface,
                 levelled,
                 painted,
                 settings,
@@ -321,6 +325,7 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
+    surface: Callable[[], NeededSurface],  # what was needed at first
     photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
@@ -330,7 +335,7 @@ def _fill_from_one_view(
     """Complete one reference, carry it into every view, and make its Gaussians."""
     solid = settings.masks.solid
     choice: ReferenceChoice = run(
-        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference)
+        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference, surface())
     )
     run.references.append(choice)
     view = next(v for v in open_views if v.camera.id == choice.camera_id)

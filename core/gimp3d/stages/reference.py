@@ -17,6 +17,7 @@ from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks, sees
 
 PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000))  # where the hidden surface is, about
+LEAST_SAMPLES = 100  # of a surface given, that must be open still
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ def choose_reference(
     wanted: str | None = None,
     solid: float = 0.9,
     settings: ReferenceSettings = ReferenceSettings(),
+    surface: NeededSurface | None = None,  # of these views, or of them when more was open; None: it is looked for
 ) -> ReferenceChoice:
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
@@ -173,8 +175,14 @@ def choose_reference(
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    surface = needed_surface(views, solid, settings)
-    seen = [_seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None for v in views]
+    seen: list[tuple[np.ndarray, np.ndarray] | None] = []
+    if surface is not None:
+        seen = _seen_in_all(views, surface, settings)
+    open_ = np.any([s[0] > 0 for s in seen if s is not None], axis=0)
+    if np.count_nonzero(open_) >= LEAST_SAMPLES:
+        seen = [None if s is None else (s[0][open_], s[1][open_]) for s in seen]
+    else:
+        seen = _seen_in_all(views, needed_surface(views, solid, settings), settings)
     candidates = [(v, *s) for v, s in zip(views, seen) if s is not None and s[0].any() and _has_rim(v, solid)]
     if not candidates:
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
@@ -200,6 +208,13 @@ def choose_reference(
     if len(plan) > 1:
         reason += "; then " + ", ".join(f"{name} to {share:.0%}" for name, share in plan[1:3])
     return ReferenceChoice(chosen.camera_id, tuple(scores), plan, chosen.score / scores[0].score, reason)
+
+
+def _seen_in_all(
+    views: Sequence[ViewMasks], surface: NeededSurface, settings: ReferenceSettings
+) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """`_seen` of every view that is large enough to be the reference."""
+    return parallel_map(lambda v: _seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None, views)
 
 
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:

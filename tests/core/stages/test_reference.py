@@ -16,6 +16,7 @@ from gimp3d.raster import render
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.reference import (
     EvidenceSettings,
+    NeededSurface,
     ReferenceSettings,
     _coarse,
     choose_reference,
@@ -86,6 +87,18 @@ def test_large_holes_are_sampled_as_well_as_small_ones() -> None:
     assert 0 < len(coarse.points) < 0.5 * len(fine.points)
     apart = np.linalg.norm(fine.points[:, None] - coarse.points[None], axis=-1)
     assert apart.min(1).max() < 0.15 and apart.min(0).max() < 0.1  # one surface, and all of it
+
+
+def test_a_surface_known_from_before_is_asked_for_what_is_open_still() -> None:
+    views = find_masks(scene(), REGION, cameras()).views
+    surface = needed_surface(views)
+    left = [replace(v, target=v.target & (np.arange(120) < 60)) for v in views]
+    found, anew = choose_reference(left, surface=surface), choose_reference(left)
+    assert found.camera_id == anew.camera_id
+    worth = {s.camera_id: s.score for s in anew.scores}
+    assert all(abs(s.score - worth[s.camera_id]) < 0.15 for s in found.scores)
+    nothing = NeededSurface(surface.points + 100, surface.normals)
+    assert choose_reference(left, surface=nothing) == anew  # it is looked for
 
 
 def test_a_wanted_view_is_taken_unless_it_does_not_see_the_hole() -> None:
