@@ -13,25 +13,25 @@ ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 FIRST = {
-    "read": (0.295, 0.213, 0.226),
-    "masks": (0.512, 0.18, 0.384),
-    "reference": (0.109, 0.011, 0.191),
-    "depth": (0.0, 0.03, 0.086),
-    "appearance": (0.005, 0.038, 0.066),
-    "mapping": (0.012, 0.042, 0.0),
-    "propagate": (0.172, 0.069, 0.215),
-    "seed": (0.017, 0.021, 0.056),
+    "read": (0.052, 0.184, 0.387),
+    "masks": (0.565, 0.159, 0.258),
+    "reference": (0.191, 0.0, 0.247),
+    "depth": (0.034, 0.037, 0.063),
+    "appearance": (0.0, 0.02, 0.149),
+    "mapping": (0.029, 0.044, 0.0),
+    "propagate": (0.184, 0.064, 0.187),
+    "seed": (0.033, 0.024, 0.038),
 }
 FURTHER = {
-    "reference": (0.0, 0.012, 0.008),
-    "depth": (0.0, 0.006, 0.032),
+    "reference": (0.02, 0.001, 0.002),
+    "depth": (0.0, 0.007, 0.021),
     "appearance": (0.0, 0.007, 0.0),
-    "mapping": (0.0, 0.009, 0.011),
-    "propagate": (0.0, 0.006, 0.02),
-    "seed": (0.0, 0.009, 0.018),
+    "mapping": (0.0, 0.01, 0.013),
+    "propagate": (0.0, 0.005, 0.022),
+    "seed": (0.0, 0.01, 0.017),
 }
-PER_STEP = (0.0, 0.02924)  # s of refinement: constant, for each million pixels of a view
-MEMORY_MB = (199.0, 57.0, 952.0)  # constant, for each million pixels of all views, for each million Gaussians
+PER_STEP = (0.0, 0.03452)  # s of refinement: constant, for each million pixels of a view
+MEMORY_MB = (225.0, 52.0, 784.0)  # constant, for each million pixels of all views, for each million Gaussians
 
 
 @dataclass(frozen=True)
