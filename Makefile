@@ -6,7 +6,8 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-large bench-references extension screenshots by-mouse clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references extension screenshots \
+	by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -38,7 +39,7 @@ lint: $(READY)
 	$(BIN)/mypy
 
 bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
-	bench-pareto
+	bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 # PROTOTYPE=folder: also against the rasteriser's first prototype
@@ -68,6 +69,10 @@ bench-harmonics: $(READY)
 # presets, ablations and baselines: half an hour
 bench-pareto: $(READY)
 	$(BIN)/python scripts/bench_refine.py $(DATA)
+
+# removals whose input is wrong: ten minutes
+bench-stability: $(READY)
+	$(BIN)/python scripts/bench_stability.py $(DATA)
 
 # desk with every Gaussian split in ten and 200 views of 960 × 540
 bench-large: $(READY)

@@ -2,8 +2,8 @@
 
     python scripts/bench_refine.py ../shared/data/withwithout [--quick] [--scenes desk,gloss] [--out build/bench_refine]
 
-Stages that two methods share are run once and counted for both. Times are CPU seconds of all threads together: they
-mean the same on a busy machine.
+Presets run whole. Ablations share stages: each is run once and counted for all. Kernels are compiled before anything
+is timed. Seconds hold all that a removal does; CPU seconds, of all threads, mean the same on a busy machine.
 """
 
 from __future__ import annotations
@@ -62,27 +62,35 @@ COUNTS = {
 DEGREES = {f"degree {degree}": seeded(sh_degree=degree) for degree in range(4)}
 STEPS = {f"{steps} steps": refined(steps) for steps in (25, 200)}
 GROUPS = {"paper": PAPER, "presets": OURS, "ablations": ABLATIONS, "counts": COUNTS, "degrees": DEGREES, "steps": STEPS}
+WHOLE = ("paper", "presets")  # groups whose methods share nothing
 # Settings of these make a stage's result; what comes before them is the same for all of ours.
 OWN_STAGES = ("seed", "refine")
 
 
+def now() -> np.ndarray:
+    """Wall and CPU seconds, [2]."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
 @dataclass
 class SharedStages:
-    """Keeps stages' results and CPU seconds; those that a method makes for itself are made anew."""
+    """Keeps stages' results and seconds; those that a method makes for itself are made anew."""
 
-    kept: dict[str, tuple[Any, float]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    started: float = 0.0
+    kept: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
+    seconds: dict[str, np.ndarray] = field(default_factory=dict)  # stage → wall and CPU seconds, [2]
+    borrowed: np.ndarray = field(default_factory=lambda: np.zeros(2))  # of stages that another method has run
+    started: np.ndarray = field(default_factory=now)
 
     def load(self, name: str) -> Any | None:
-        self.started = time.process_time()
+        self.started = now()
         if name in self.kept and not name.startswith(OWN_STAGES):
             result, self.seconds[name] = self.kept[name]
+            self.borrowed = self.borrowed + self.seconds[name]
             return result
         return None
 
     def save(self, name: str, result: Any) -> None:
-        self.seconds[name] = time.process_time() - self.started
+        self.seconds[name] = now() - self.started
         self.kept[name] = (result, self.seconds[name])
 
 
@@ -139,17 +147,17 @@ def agreement(scene: Scene, filled: Gaussians, result: RemovalResult) -> float:
 
 
 def measure(scene: Scene, name: str, settings: RemovalSettings, shared: SharedStages) -> dict[str, Any]:
-    shared.seconds = {}
-    before = time.process_time()
+    shared.seconds, shared.borrowed = {}, np.zeros(2)
+    before = now()
     result = remove_object(
         scene.gaussians, scene.views, scene.region, settings, scene.reference.id, scene.picture, store=shared
     )
-    outside = time.process_time() - before  # of the shared stages; contains those that were run now
+    wall, cpu = now() - before + shared.borrowed
     kept = scene.gaussians.take(result.keep)
     filled = kept.extended(result.added) if result.added else kept
     reached = max(1, sum(int(v.sum()) for v in _targets(shared)))
     row: dict[str, Any] = {"scene": scene.name, "method": name, "added": len(filled) - len(kept)}
-    row |= {"cpu": dict(shared.seconds), "seconds": sum(shared.seconds.values()), "process": outside}
+    row |= {"stages": {s: spent[0] for s, spent in shared.seconds.items()}, "seconds": wall, "cpu seconds": cpu}
     row |= {"share": row["added"] / reached, "agreement": agreement(scene, filled, result)}
     row |= {"reasons": {s.name: s.reason for s in result.stages if s.name.startswith(OWN_STAGES)}}
     return row | scores([render_bytes(filled, t[0]) for t in scene.tests], scene)
@@ -165,14 +173,15 @@ def baselines(scene: Scene, removed: np.ndarray) -> list[dict[str, Any]]:
     """The open hole, and Telea's fill of the true mask on the photo."""
     kept = scene.gaussians.take(~removed)
     rows = []
-    start = time.process_time()
+    start = now()
     grown = [cv2.dilate(t[2].astype(np.uint8), np.ones((2 * DILATION + 1,) * 2, np.uint8)) for t in scene.tests]
     telea = [cv2.inpaint(photo, g, 3, cv2.INPAINT_TELEA) for photo, g in zip(scene.with_object, grown)]
-    seconds = time.process_time() - start
+    spent = now() - start
     opened = [render_bytes(kept, t[0]) for t in scene.tests]
-    for name, pictures, spent in (("hole open", opened, 0.0), ("telea", telea, seconds)):
-        row = {"scene": scene.name, "method": name, "added": 0, "seconds": spent, "cpu": {}, "share": 0.0}
-        rows.append(row | {"group": "baselines"} | scores(pictures, scene))
+    for name, pictures, (wall, cpu) in (("hole open", opened, np.zeros(2)), ("telea", telea, spent)):
+        row = {"scene": scene.name, "method": name, "added": 0, "share": 0.0, "stages": {}}
+        row |= {"seconds": wall, "cpu seconds": cpu, "group": "baselines"}
+        rows.append(row | scores(pictures, scene))
     return rows
 
 
@@ -181,22 +190,31 @@ def run(
 ) -> list[dict[str, Any]]:
     """Every method on every scene; what is measured so far lies in refine.json."""
     rows: list[dict[str, Any]] = []
-    first = load_scene(data / scenes[0])
-    measure(first, "kernels compiled, nothing kept", refined(1), SharedStages())
+    compile_kernels(load_scene(data / scenes[0]), groups)
     for name in scenes:
-        scene, ours = load_scene(data / name), SharedStages()
+        scene, shared = load_scene(data / name), SharedStages()
         for group, methods in groups.items():
             for method, settings in methods.items():
-                shared = SharedStages() if group == "paper" else ours
-                rows.append(measure(scene, method, settings, shared) | {"group": group})
-                row = rows[-1]
-                print(
-                    f"{name:8}{method:28}{row['psnr mask']:7.2f}{row['psnr unseen']:7.2f}{row['added']:6}", flush=True
-                )
-        if "masks" in ours.kept:
-            rows += baselines(scene, ours.kept["masks"][0].removed)
+                store = SharedStages() if group in WHOLE else shared
+                row = measure(scene, method, settings, store) | {"group": group}
+                rows.append(row)
+                if method == "balanced":
+                    shared = store
+                numbers = "".join(f"{row[k]:8.2f}" for k in ("psnr mask", "psnr unseen", "seconds", "cpu seconds"))
+                print(f"{name:8}{method:28}{numbers}{row['added']:7}", flush=True)
+        if "masks" in shared.kept:
+            rows += baselines(scene, shared.kept["masks"][0].removed)
         (out / "refine.json").write_text(json.dumps(rows, indent=1))
     return rows
+
+
+def compile_kernels(scene: Scene, groups: Mapping[str, Mapping[str, RemovalSettings]]) -> None:
+    """Each method once, with a single step of refinement: nothing that is timed compiles or loads anything."""
+    ready = SharedStages()
+    for group, methods in groups.items():
+        for settings in methods.values():
+            short = replace(settings, refine=replace(settings.refine, steps=min(1, settings.refine.steps)))
+            measure(scene, "", short, SharedStages() if group in WHOLE else ready)
 
 
 def main() -> None:

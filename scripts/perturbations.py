@@ -1,9 +1,9 @@
-"""Small errors of what a removal is given: poses, depths, the region. Each the same for the same seed."""
+"""Errors of what a removal is given: poses, depths, photos, region, views. Each the same for the same seed."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -13,13 +13,18 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from gimp3d import pipeline
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.raster import Drawing, RasterSettings, Rendering, use_backend
 from gimp3d.raster.backend import Backend, current_backend
+from gimp3d.stages.depth import DepthCompletion
+from gimp3d.stages.masks import ViewMasks
 
 GRAIN = 3.0  # px, σ of the blur that makes depth errors as coarse as splats are
+GARBLED = 16  # px, side of the squares that hold another part of a garbled photo
+Photos = Mapping[str, np.ndarray]  # ID → [H, W, 3] uint8
 
 
 def turned(camera: Camera, pixels: float, rng: np.random.Generator) -> Camera:
@@ -110,6 +115,77 @@ def noisy_depths(relative: float, seed: int) -> Iterator[None]:
         yield
     finally:
         use_backend(before)
+
+
+@contextmanager
+def noisy_surfaces(relative: float, seed: int) -> Iterator[None]:
+    """The completed surfaces of all references are off by `relative` (one standard deviation) inside."""
+    exact = pipeline.complete_depth
+
+    def noisy(view: ViewMasks, *given: Any) -> DepthCompletion:
+        done = exact(view, *given)
+        errors = depth_errors(view.camera.id, *done.depth.shape, seed)
+        return replace(done, depth=done.depth * (1 + relative * errors))
+
+    pipeline.complete_depth = noisy
+    try:
+        yield
+    finally:
+        pipeline.complete_depth = exact
+
+
+def gathered(
+    cameras: Sequence[Camera],
+    middle: Camera,
+    centre: np.ndarray,  # [3] what they look at
+    degrees: float,
+) -> tuple[Camera, ...]:
+    """The middle camera, turned about `centre` towards each of the cameras: by `degrees` towards the farthest."""
+
+    def towards(camera: Camera) -> np.ndarray:
+        away = camera.centre - centre
+        return away / np.linalg.norm(away)
+
+    turns = []
+    for camera in cameras:
+        across = np.cross(towards(middle), towards(camera))
+        angle = np.arctan2(np.linalg.norm(across), towards(middle) @ towards(camera))
+        turns.append(angle * across / max(np.linalg.norm(across), 1e-12))
+    widest = max(np.linalg.norm(turns, axis=1).max(), 1e-12)
+    found = []
+    for camera, turn in zip(cameras, turns):
+        moved_scene = np.eye(4)
+        moved_scene[:3, :3] = cv2.Rodrigues(-turn * np.radians(degrees) / widest)[0]
+        moved_scene[:3, 3] = centre - moved_scene[:3, :3] @ centre
+        found.append(replace(middle, id=camera.id, viewmat=middle.viewmat @ moved_scene, split="train", image=None))
+    return tuple(found)
+
+
+def exposed(photos: Photos, share: float, seed: int) -> dict[str, np.ndarray]:
+    """Each photo times a gain of its own, from 1 − share to 1 + share."""
+    gains = np.random.default_rng(seed).uniform(1 - share, 1 + share, len(photos))
+    return {n: np.clip(np.rint(p * g), 0, 255).astype(np.uint8) for (n, p), g in zip(photos.items(), gains)}
+
+
+def misplaced(photos: Photos, share: float, seed: int) -> dict[str, np.ndarray]:
+    """A share of the photos, at least two, under each other's names."""
+    names = np.random.default_rng(seed).permutation(list(photos))[: max(2, round(share * len(photos)))]
+    return {**photos, **{str(a): photos[b] for a, b in zip(names, np.roll(names, 1))}}
+
+
+def garbled(photos: Photos, share: float, seed: int) -> dict[str, np.ndarray]:
+    """Squares that cover about a share of every photo show another part of it."""
+    rng = np.random.default_rng(seed)
+    found = {}
+    for name, photo in photos.items():
+        rows, cols = (n // GARBLED for n in photo.shape[:2])
+        whole = photo.copy()
+        squares = whole[: rows * GARBLED, : cols * GARBLED].reshape(rows, GARBLED, cols, GARBLED, 3).swapaxes(1, 2)
+        wrong = rng.random((rows, cols)) < share
+        squares[wrong] = squares[rng.integers(rows, size=wrong.sum()), rng.integers(cols, size=wrong.sum())]
+        whole[: rows * GARBLED, : cols * GARBLED] = squares.swapaxes(1, 2).reshape(rows * GARBLED, cols * GARBLED, 3)
+        found[name] = whole
+    return found
 
 
 def resized(region: Region, factor: float) -> Region:

@@ -84,7 +84,7 @@ class RemovalSettings:
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
+    "draft": RemovalSettings(extra_references=2, extra_gain=0.02),
     "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
     "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
@@ -100,12 +100,14 @@ PRESETS: dict[str, RemovalSettings] = {
         extra_references=0,
     ),
 }
-# The paper as it is printed, as far as it can be run: the guidance's and the visibility's signs. As printed, patches
-# are not compared at p at all, and the finest level comes first: that gives no field.
+# The paper as it is printed: the signs of the guidance (told only with a depth prior) and of the visibility, the patch
+# cost without p, SH that are not anchored and lack 3DGS's 0.5. Of several levels, the finest first gives no field.
+_PAPER = PRESETS["paper"]
 PRESETS["paper-literal"] = replace(
-    PRESETS["paper"],
-    depth=replace(PRESETS["paper"].depth, scale_factor=-0.1),
-    mapping=MappingSettings(visibility=-MappingSettings().visibility),
+    _PAPER,
+    depth=replace(_PAPER.depth, scale_factor=-0.1),
+    mapping=replace(_PAPER.mapping, visibility=-_PAPER.mapping.visibility, as_printed=True),
+    seed=replace(_PAPER.seed, grey=0.0, harmonics=replace(_PAPER.seed.harmonics, anchored=False)),
 )
 
 

@@ -75,6 +75,7 @@ class HarmonicsSettings:
 
     floor: float = 0.2  # of the ridge, in observations, for a cone of directions of about 60° (see fit_harmonics)
     offset: bool = False  # fit along, and leave out, what all views are off by against the reference
+    anchored: bool = True  # the basis is Y(ω) − Y(ω_0); False: Y(ω), as printed, which misses c_0 in ω_0 itself
     ridge: float | None = None  # this ridge and the highest degree for all, the paper's weights: nothing is chosen
 
 
@@ -223,6 +224,7 @@ def fit_harmonics(
         np.float32(sigma),
         np.float32(settings.floor),
         settings.offset,
+        settings.anchored,
         np.float32(-1 if settings.ridge is None else settings.ridge),
         fit.sh,
         fit.degree,
@@ -264,6 +266,7 @@ def _fit_groups(
     sigma,
     floor,
     offset,
+    anchored,
     ridge,  # < 0: chosen per Gaussian
     sh,
     degrees,
@@ -279,7 +282,7 @@ def _fit_groups(
     for group in range(lo, hi):
         rows = order[group * LANES : (group + 1) * LANES]
         count = _stage(rows, offsets, directions, colours, weights, anchors, anchor_directions, staged, s)
-        _expand(count, degree, sigma, staged, s)
+        _expand(count, degree, sigma, anchored, staged, s)
         _normal_equations(count, k, offset, staged, s)
         if ridge < ZERO and degree > 0:
             _set_ridge(FIRST_STEP * floor, s)
@@ -361,10 +364,12 @@ def _stage(rows, offsets, directions, colours, weights, anchors, anchor_directio
 
 
 @exact_kernel
-def _expand(count, degree, sigma, staged, s):
+def _expand(count, degree, sigma, anchored, staged, s):
     """Y(ω) − Y(ω_0) in the place of the directions, and the paper's weights e_ω times the given ones."""
     _basis(degree, s, TOWARDS, s, ANCHOR)
     k = (degree + 1) * (degree + 1) - 1
+    for j in range(0 if anchored else k):
+        store16(s, ANCHOR + j * LANES, splat16(ZERO))
     scale = -float32(0.5) * LOG2E / (sigma * sigma)
     for v in range(count):
         at = v * STAGED

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel
-from ..solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field
+from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
 from ..threads import run_ranges
 from .reference import disparity_of
@@ -24,6 +24,7 @@ class MappingSettings:
     visibility: float = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
     depth_tolerance: float = 0.02  # z-test of visibility, relative
     geometry: bool = True  # patches lie on the surface (METHOD section 4); the paper's lie in the picture
+    as_printed: bool = False  # patches are compared at f(p) and copied from p + f(p): the paper's cost misses p
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
 
@@ -88,6 +89,8 @@ def mapping_field(
     if settings.geometry and camera is not None and depth is not None:
         surface = tangent_planes(disparity_of(depth), camera.K)
     nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch, surface)
+    if settings.as_printed:
+        nearest = _moved_by_places(nearest, source)
     found = nearest.found
     if not target.any():
         confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
@@ -104,6 +107,17 @@ def mapping_field(
         reason = f"fill explained to {misfit:.1f} grey levels; "
         reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
     return MappingField(nearest.rows, nearest.cols, nearest.cost, visibility, confidence, reason)
+
+
+def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
+    """The place that was compared taken as the offset f(p); none where p + f(p) is no source."""
+    places = np.argwhere(nearest.found)
+    moved = places + np.stack([nearest.rows, nearest.cols], -1)[nearest.found]
+    kept = (moved < source.shape).all(1)
+    kept[kept] = source[tuple(moved[kept].T)]
+    rows, cols = np.full((2, *source.shape), -1, np.int32)
+    rows[tuple(places[kept].T)], cols[tuple(places[kept].T)] = moved[kept].T
+    return replace(nearest, rows=rows, cols=cols)
 
 
 @exact_kernel

@@ -13,6 +13,7 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
 from ..raster import PictureGradients, RasterSettings, contributions, pixel_region, touched_window
+from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
 from .masks import sees
@@ -21,6 +22,8 @@ from .propagate import PaintedView, Rule
 from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
+SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all
+CUT = 9.0  # of the usual miss of a view at a Gaussian (6 σ): what is missed by more is a wrong picture
 LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
 
 
@@ -37,13 +40,14 @@ class SeedSettings:
     opacity: float = 0.98
     sink: float = 0.25  # depth under the surface, in standard deviations; see settle_gaussians
     needed: float = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
-    corrections: int = 1  # steps by which c_0 is corrected so that the scene, drawn, shows the painted views
-    hold: float = 3.0  # px of blend weight by which c_0 is held at the reference's colour
+    corrections: int = 1  # steps by which colours are corrected so that the scene, drawn, shows the painted views
+    hold: float = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
     looks: int = 12  # painted views that both of these are judged by
     sh_degree: int = 2  # the highest of new Gaussians; each gets the one that its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
     harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
+    grey: float = 0.5  # what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
     depth_tolerance: float = 0.02  # z-test of observations
 
 
@@ -232,14 +236,16 @@ def colour_gaussians(
 ) -> Gaussians:
     """The seeds with view-dependent colour fitted to the painted views; c_0 stays what the reference shows."""
     degree, bands = min(settings.sh_degree, scene_degree), (scene_degree + 1) ** 2
-    if degree == 0:
-        return replace(seeds, sh=pad_sh(seeds.sh, bands))
-    means = seeds.means.astype(np.float64)
-    seen = parallel_map(lambda pair: _seen_in(means, *pair, settings.depth_tolerance), zip(views, painted))
-    colours = 0.5 + SH_C0 * seeds.sh[:, 0].astype(np.float64)
-    observations = gather_observations(len(seeds), seen)
-    fit = fit_harmonics(colours, _towards(means, reference), observations, degree, settings.harmonics)
-    return replace(seeds, sh=pad_sh(fit.sh, bands))
+    sh = seeds.sh
+    if degree > 0:
+        means = seeds.means.astype(np.float64)
+        seen = parallel_map(lambda pair: _seen_in(means, *pair, settings.depth_tolerance), zip(views, painted))
+        colours = 0.5 + SH_C0 * sh[:, 0].astype(np.float64)
+        observations = gather_observations(len(seeds), seen)
+        sh = fit_harmonics(colours, _towards(means, reference), observations, degree, settings.harmonics).sh
+    sh = pad_sh(sh, bands).copy()
+    sh[:, 0] += (0.5 - settings.grey) / SH_C0
+    return replace(seeds, sh=sh)
 
 
 def settle_gaussians(
@@ -253,9 +259,10 @@ def settle_gaussians(
     """The new Gaussians that are needed, with colours such that the scene, drawn, shows the painted views.
 
     Splats overlap one another and the rim, so a splat in its pixel's colour does not draw that pixel. A picture is
-    linear in the colours c_0, pixels = W c_0 + known; one gradient step of least squares, scaled by W's column sums
-    (SIRT), takes most of what is missing. It is taken over views all round: a step for the reference alone would undo,
-    there, how near splats cover far ones, and double that on the other side.
+    linear in the colours c, pixels = W c + known; one gradient step of least squares, scaled by W's column sums
+    (SIRT), takes most of what is missing. It is taken over views all round, and fits each Gaussian's coefficients to
+    what each view misses: a step for the reference alone would undo, there, how near splats cover far ones, and double
+    that on the other side.
 
     That covering moves the texture away from whoever looks, by part of a splat. Splats a little under the surface move
     it back, from all sides: parallax draws what is deeper nearer to the viewer's foot.
@@ -274,9 +281,10 @@ def settle_gaussians(
     new = new.take(np.max(peaks, axis=0) >= settings.needed)
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(partial(_colour_step, scene, new), looks)
-        weights, missing = (np.sum(part, axis=0) for part in zip(*steps))
+        towards = [_towards(new.means.astype(np.float64), view) for view, _ in looks]
+        change = _colour_change(steps, towards, min(settings.sh_degree, new.sh_degree), settings.hold)
         sh = new.sh.copy()
-        sh[:, 0] += missing / (weights + settings.hold)
+        sh[:, : change.shape[1]] += change
         new = replace(new, sh=sh)
     return new
 
@@ -291,6 +299,37 @@ def _sunk(
     normals = quats_to_matrices(gaussians.quats.astype(np.float64))[:, :, 2]
     normals *= np.sign((normals * (means - reference.centre)).sum(-1, keepdims=True))
     return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
+
+
+def _colour_change(
+    steps: Sequence[tuple[np.ndarray, np.ndarray]],  # per view: weights and what is missing, [N, 3] each
+    towards: Sequence[np.ndarray],  # per view: unit directions to the Gaussians, [N, 3]
+    degree: int,
+    hold: float,  # weight by which each coefficient is held
+) -> np.ndarray:
+    """What must be added to the coefficients, [N, K, 3]: robust least squares with a ridge, over the views' directions.
+
+    The basis is taken less its mean over the views, so that what all of them miss is no view dependence, and few
+    directions, or near ones, tell c_0 alone. What a view misses by far more than is usual counts little (Geman and
+    McClure 1987): its photo is wrong there.
+    """
+    weights = [w[:, :1] for w, _ in steps]
+    misses = [np.linalg.norm(m, axis=1, keepdims=True) / np.maximum(w, SHOWN) for w, (_, m) in zip(weights, steps)]
+    shown = np.concatenate(weights) > SHOWN
+    usual = max(1e-6, float(np.median(np.concatenate(misses)[shown]))) if shown.any() else 1.0
+    trust = [1 / (1 + (m / (CUT * usual)) ** 2) ** 2 for m in misses]
+    weights = [w * t for w, t in zip(weights, trust)]
+    bases = [sh_basis(t, degree) / SH_C0 for t in towards]
+    middle = sum(w * y for w, y in zip(weights, bases)) / np.maximum(sum(weights), 1e-9)
+    middle[:, 0] = 0.0
+    normal, right = hold * np.eye(middle.shape[1]), np.zeros(())
+    for w, y, t, (_, missing) in zip(weights, bases, trust, steps):
+        apart = y - middle
+        normal = normal + (w * apart)[:, :, None] * apart[:, None]
+        right = right + apart[:, :, None] * (t * missing)[:, None]
+    change = np.linalg.solve(normal, right)
+    change[:, 0] -= (middle[..., None] * change).sum(1)
+    return change
 
 
 def _colour_step(scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]) -> tuple[np.ndarray, np.ndarray]:

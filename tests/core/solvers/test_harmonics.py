@@ -131,6 +131,25 @@ def test_true_coefficients_are_found_from_enough_directions() -> None:
     np.testing.assert_allclose(chosen.sh[:, :9], true, atol=5e-3)
 
 
+def test_as_printed_the_basis_is_not_anchored_and_misses_the_references_colour() -> None:
+    rng = np.random.default_rng(5)
+    anchors, towards = rng.uniform(0.3, 0.7, (4, 3)), directions(4, 1)
+    seen = near(towards, 40, 1.0, 2)
+    colours = anchors[:, None] + 0.1 * seen[..., :1]
+    printed = fit_harmonics(anchors, towards, dense(seen, colours), 1, HarmonicsSettings(ridge=1e-4, anchored=False))
+    np.testing.assert_allclose(printed.sh[:, 0], (anchors - 0.5) / SH_C0, atol=1e-5)
+    residuals = colours - anchors[:, None]
+    weights = np.exp(
+        -(residuals**2).sum(-1) / (2 * (printed.sigma * np.exp(1 - np.einsum("nvc,nc->nv", seen, towards))) ** 2)
+    )
+    for n in range(4):
+        basis, root = sh_basis(seen[n], 1)[:, 1:], np.sqrt(weights[n])[:, None]
+        expected = np.linalg.lstsq(root * basis, root * residuals[n], rcond=None)[0]
+        np.testing.assert_allclose(printed.sh[n, 1:], expected, atol=2e-4)
+    there = seen_colours(printed.sh, towards[:, None])[:, 0]
+    assert np.abs(there - anchors).max() > 0.02
+
+
 def reference_fit(
     anchors: np.ndarray,  # [N, 3]
     towards: np.ndarray,  # [N, 3]

@@ -202,3 +202,21 @@ def test_without_depth_the_field_is_the_pictures(value: float) -> None:
     field = mapping_field(picture, target, ~target, visibility, camera=camera(width=128, height=64), depth=depth)
     rows, cols = np.nonzero(target)
     assert ((field.rows[target] == rows) & (field.cols[target] == cols + 42)).mean() > 0.95
+
+
+def test_as_printed_sources_are_off_by_the_place_that_they_are_for() -> None:
+    rng = np.random.default_rng(2)
+    image = rng.integers(0, 256, (60, 80, 3), np.uint8)
+    target = np.zeros((60, 80), bool)
+    target[20:30, 20:36] = True
+    nowhere = np.zeros(target.shape, np.float32)
+    plain, printed = (
+        mapping_field(image, target, ~target, nowhere, MappingSettings(geometry=False, as_printed=p))
+        for p in (False, True)
+    )
+    rows, cols = np.indices(target.shape)
+    legal = target & (plain.rows + rows < 60) & (plain.cols + cols < 80)
+    legal[legal] = ~target[(plain.rows + rows)[legal], (plain.cols + cols)[legal]]
+    assert 0 < legal.sum() < target.sum()
+    np.testing.assert_array_equal(printed.rows, np.where(legal, plain.rows + rows, -1))
+    np.testing.assert_array_equal(printed.cols, np.where(legal, plain.cols + cols, -1))

@@ -12,13 +12,22 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scenes import cameras, floor, truth
 
+from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, Gaussians, quats_to_matrices
+from gimp3d.gaussians import SH_C0, Gaussians, pad_sh, quats_to_matrices
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 from gimp3d.solvers.harmonics import HarmonicsSettings, sh_basis
 from gimp3d.stages.propagate import PaintedView, Rule, ViewToPaint
-from gimp3d.stages.seed import SeedSettings, _patches, colour_gaussians, seed_gaussians, settle_gaussians
+from gimp3d.stages.seed import (
+    CUT,
+    SeedSettings,
+    _colour_change,
+    _patches,
+    colour_gaussians,
+    seed_gaussians,
+    settle_gaussians,
+)
 
 
 @pytest.mark.parametrize("largest", [1, 4])
@@ -252,6 +261,73 @@ def test_settled_colours_leave_no_seam_and_show_every_view_better_than_pixel_col
     assert seams[1] < 1.25
     open_rim = [np.hypot(*np.gradient((render_bytes(known, v.camera).astype(float) - v.image).mean(-1))) for v in views]
     assert np.mean([steps[v.target].mean() for steps, v in zip(open_rim, views)]) > 3 * np.mean(at_rim)
+
+
+def _tinted(paint: PaintedView, camera: Camera, slope: float, offset: float) -> PaintedView:
+    """The picture, brighter by `offset` and, for a camera one radian towards +x, by `slope` grey levels more."""
+    towards = -camera.centre / np.linalg.norm(camera.centre)
+    image = np.clip(paint.image.astype(float) + offset + slope * towards[0], 0, 255).astype(np.uint8)
+    return replace(paint, image=image)
+
+
+def test_what_each_view_misses_tells_view_dependence_and_what_all_miss_does_not() -> None:
+    views, painted = _hole_and_truth()
+    known = floor(with_hole=True)
+    known = replace(known, sh=pad_sh(known.sh, 9))
+    seeds = seed_gaussians(views[1].camera, views[1].image, views[1].depth_new, views[1].target, False)
+    seeds = replace(seeds, sh=pad_sh(seeds.sh, 9))
+
+    def error(new: Gaussians, wanted: list[PaintedView]) -> float:
+        drawn = [render_bytes(known.extended(new), v.camera).astype(float) for v in views]
+        return float(np.mean([(d - p.image)[v.target].mean() ** 2 for d, p, v in zip(drawn, wanted, views)]) ** 0.5)
+
+    def settled(degree: int, wanted: list[PaintedView]) -> Gaussians:
+        seen_by = [v.camera for v in views]
+        return settle_gaussians(known, seeds, views[1].camera, seen_by, wanted, SeedSettings(sh_degree=degree))
+
+    sloped = [_tinted(p, v.camera, 30, 0) for p, v in zip(painted, views)]
+    constant, dependent = settled(0, sloped), settled(2, sloped)
+    assert (constant.sh[:, 1:] == 0).all() and (dependent.sh[:, 1:] != 0).any()
+    assert error(dependent, sloped) < 0.5 * error(constant, sloped)
+    plain = settled(2, painted)
+    lifted = settled(2, [_tinted(p, v.camera, 0, 20) for p, v in zip(painted, views)])
+    step = lifted.sh[:, 0] - plain.sh[:, 0]
+    assert np.median(step) * SH_C0 * 255 > 10
+    assert np.median(np.abs(lifted.sh[:, 1:] - plain.sh[:, 1:])) < 0.02 * np.median(step)
+
+
+def test_few_or_near_views_tell_the_constant_alone() -> None:
+    rng = np.random.default_rng(0)
+    steps = [(np.full((5, 3), 4.0), rng.choice([-1, 1], (5, 3)) * np.ones((5, 3))) for _ in range(3)]
+    towards = np.tile([0.0, 0.6, 0.8], (5, 1))
+    same = _colour_change(steps, [towards] * 3, 2, 3.0)
+    assert same.shape == (5, 9, 3)
+    trust = 1 / (1 + 1 / CUT**2) ** 2  # all miss as much as is usual
+    np.testing.assert_allclose(same[:, 0], trust * sum(m for _, m in steps) / (trust * 12 + 3))
+    np.testing.assert_allclose(same[:, 1:], 0, atol=1e-12)
+    nobody = _colour_change([(0 * w, 0 * m) for w, m in steps], [towards] * 3, 2, 3.0)
+    np.testing.assert_array_equal(nobody, 0)
+
+
+def test_a_wrong_picture_tells_next_to_nothing() -> None:
+    rng = np.random.default_rng(1)
+    towards = rng.normal(size=(12, 6, 3))
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    steps = [(np.full((6, 3), 9.0), 9 * (0.02 + 0.03 * t[:, :1]) * np.ones((6, 3))) for t in towards]
+    right = _colour_change(steps, list(towards), 1, 0.01)
+    wrong = _colour_change([*steps[:-1], (steps[-1][0], np.full((6, 3), 9 * 2.0))], list(towards), 1, 0.01)
+    shown = np.einsum("nk,nkc->nc", sh_basis(towards[0], 1), right) / SH_C0
+    np.testing.assert_allclose(shown, 0.02 + 0.03 * towards[0][:, :1] * np.ones((6, 3)), atol=2e-3)
+    assert np.abs(wrong - right).max() < 0.2 * np.abs(right).max()
+
+
+def test_the_papers_constant_lacks_what_3dgs_adds() -> None:
+    camera = cameras(9)[1]
+    depth = render(truth(), camera).median_depth
+    seeds = seed_gaussians(camera, render_bytes(truth(), camera), depth, depth > 0, False)
+    ours, papers = (colour_gaussians(seeds, camera, [], [], 2, SeedSettings(grey=g)) for g in (0.5, 0.0))
+    np.testing.assert_allclose(papers.sh[:, 0] - ours.sh[:, 0], 0.5 / SH_C0, rtol=1e-5)
+    np.testing.assert_allclose(ours.sh[:, 0], seeds.sh[:, 0], atol=1e-6)  # float32, there and back
 
 
 def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
