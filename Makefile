@@ -6,7 +6,8 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references extension screenshots clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references extension screenshots \
+	by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -99,6 +100,11 @@ extension: $(READY)
 screenshots: demo
 	cp build/demo/before_after.png assets/before_after.png
 	$(BIN)/python scripts/screenshots.py
+
+# a removal by mouse, by script and by command in a real Blender gives the same bytes: needs what screenshots needs
+by-mouse: $(READY)
+	$(BIN)/python scripts/by_mouse.py
+	$(BIN)/python scripts/by_mouse.py --suite sid
 
 clean:
 	rm -rf build dist $(VENV)

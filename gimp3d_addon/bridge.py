@@ -23,6 +23,7 @@ from gimp3d.errors import BadInput
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
 SENSOR = 36.0  # mm, of imported cameras
+STRAIGHT = 1e-6  # from here on a turn is meant: Blender's own quarter turns are off by 4e-8
 
 
 def present(scene: bpy.types.Scene, obj: bpy.types.Object | None) -> bpy.types.Object | None:
@@ -45,7 +46,15 @@ def splat_frame(obj: bpy.types.Object) -> np.ndarray:
     axes = matrix[:3, :3] / lengths
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-4 or np.linalg.det(axes) < 0:
         raise BadInput(f"{obj.name} is mirrored or sheared; clear its scale (Object > Clear > Scale)")
+    if np.abs(axes - np.round(axes)).max() < STRAIGHT:
+        matrix[:3, :3] = np.round(axes) * _typed(lengths)
     return matrix
+
+
+def _typed(numbers: np.ndarray) -> np.ndarray:
+    """float32 numbers as a user would write them: 0.1 for 0.10000000149, and 0 for what a quarter turn leaves of it."""
+    there = np.abs(numbers) > 1e-7 * np.abs(numbers).max()
+    return np.array([float(str(np.float32(n))) if t else 0.0 for n, t in zip(numbers, there)])
 
 
 def camera_from_blender(
@@ -130,8 +139,11 @@ def _moved(viewmat: np.ndarray, imported: np.ndarray, frame: np.ndarray) -> bool
     return bool(np.abs(step[:3, :3]).max() > 1e-4 or np.linalg.norm(step[:3, 3]) > 1e-4 * reach)
 
 
-def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
-    """A Blender camera (not yet linked) that frames what `camera` does; its exact numbers travel with it."""
+def camera_to_blender(camera: Camera, frame: Matrix, number: int = 0) -> bpy.types.Object:
+    """A Blender camera (not yet linked) that frames what `camera` does; its exact numbers travel with it.
+
+    `number` is its place in the file: views keep the file's order.
+    """
     data = bpy.data.cameras.new(camera.id)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR
     data.lens = camera.fx * SENSOR / camera.width
@@ -144,6 +156,7 @@ def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
     obj[CAMERA] = json.dumps(
         {
             "id": camera.id,
+            "number": number,
             "width": camera.width,
             "height": camera.height,
             "fx": camera.fx,
@@ -162,6 +175,8 @@ def camera_to_blender(camera: Camera, frame: Matrix) -> bpy.types.Object:
 def box_from_blender(obj: bpy.types.Object, frame: np.ndarray) -> Box:
     """A cube (any mesh's bounds) in the splat's frame; any rotation, scale and parent.
 
+    Its numbers are those that a user would write into a ROI file, so that both give the same bytes.
+
     Raises
     ------
     BadInput
@@ -170,9 +185,13 @@ def box_from_blender(obj: bpy.types.Object, frame: np.ndarray) -> Box:
     corners = np.array([tuple(c) for c in obj.bound_box], dtype=np.float64)
     matrix = np.linalg.inv(frame) @ np.array(obj.matrix_world, dtype=np.float64)
     try:
-        return box_from_matrix(matrix, corners.min(0), corners.max(0))
+        box = box_from_matrix(matrix, corners.min(0), corners.max(0))
     except BadInput as error:
         raise BadInput(f"{obj.name}: {error}") from None
+    turn = np.round(box.axes)
+    if np.abs(box.axes - turn).max() < STRAIGHT:  # by quarters: the same points without a turn
+        box = Box.make(box.center, np.abs(turn) @ box.size)
+    return Box.make(_typed(box.center), _typed(box.size), _typed(box.rotation_wxyz))
 
 
 def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
@@ -243,7 +262,7 @@ def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Camera objects of the scene or of the chosen collection, by name."""
+    """Camera objects of the scene or of the chosen collection: imported ones in their file's order, others by name."""
     settings = scene.gimp3d
     if settings.views == "COLLECTION":
         if settings.view_collection is None:
@@ -251,7 +270,11 @@ def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
         pool: Iterable[bpy.types.Object] = (o for o in settings.view_collection.all_objects if present(scene, o))
     else:
         pool = scene.objects
-    return sorted((o for o in pool if o.type == "CAMERA"), key=lambda o: o.name)
+    return sorted((o for o in pool if o.type == "CAMERA"), key=lambda o: (_number(o), o.name))
+
+
+def _number(obj: bpy.types.Object) -> int:
+    return json.loads(obj[CAMERA]).get("number", 0) if CAMERA in obj else 0
 
 
 def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:

@@ -7,6 +7,7 @@ along, and Cancel must be immediate.
 from __future__ import annotations
 
 import json
+import os
 import queue
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,9 @@ def own_python() -> str:
     return found
 
 
+GIVE_WAY = 10  # how much nicer than Blender a child is, so that drawing does not wait for a core
+
+
 class Killed(Gimp3dError):
     """The child was ended from outside, so what it was doing can be gone on with."""
 
@@ -80,11 +85,15 @@ class Worker:
                 stderr=self._errors,
                 text=True,
                 encoding="utf-8",
+                creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0),  # Windows'
             )
         except OSError as error:
             raise BadInput(
                 f"cannot start {command[0]} ({error.strerror}); choose a Python in the preferences"
             ) from None
+        if hasattr(os, "setpriority"):
+            with suppress(OSError):  # it may have ended already
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, os.getpriority(os.PRIO_PROCESS, 0) + GIVE_WAY)
         self._lines: queue.Queue[str] = queue.Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -148,7 +157,7 @@ class Worker:
 
     def words(self, pace: float = 1.0) -> str:
         """What to show: the stage and, of a removal, the time left."""
-        if self._clock is None:
+        if self._clock is None or self.summary is not None:
             return self.status
         left = self._clock.seconds_left(time.monotonic() - self._started, pace)
         return f"{self.status} · about {duration(left)} left"

@@ -1,7 +1,7 @@
 """What a removal will cost, told before it starts, and how far a running one is.
 
-The constants are measured (4 cores, kernels compiled; the demo and the desk scene, 50,000 Gaussians and 24–36 views of
-480×270, and a scan of 125,000): good to a factor of two. Who runs removals multiplies by their own last run's pace.
+The constants are written by scripts/calibrate_forecast.py, which measures them (4 cores, kernels compiled; the demo
+scene with up to four times the Gaussians and pixels). Who runs removals multiplies by their own last run's pace.
 """
 
 from __future__ import annotations
@@ -11,12 +11,27 @@ from dataclasses import dataclass, field
 ROUNDS = {"draft": 3, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
 ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
-PER_STEP = 0.005  # s
-PER_MEGAPIXEL = {"read": 0.3, "masks": 0.6, "reference": 0.2, "propagate": 0.3}  # s for each million pixels of views
-PER_STAGE = {"depth": 0.25, "appearance": 0.3, "mapping": 0.1, "seed": 0.05}  # s
-PER_MILLION_VIEWED = 0.5  # s of masks for each million Gaussians in each view
-BASE_MB, MB_PER_MEGAPIXEL, MB_PER_MILLION = 350.0, 40.0, 1000.0
-REFINE_MB = 50.0  # the views, made ready
+# s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
+FIRST = {
+    "read": (0.052, 0.184, 0.387),
+    "masks": (0.565, 0.159, 0.258),
+    "reference": (0.191, 0.0, 0.247),
+    "depth": (0.034, 0.037, 0.063),
+    "appearance": (0.0, 0.02, 0.149),
+    "mapping": (0.029, 0.044, 0.0),
+    "propagate": (0.184, 0.064, 0.187),
+    "seed": (0.033, 0.024, 0.038),
+}
+FURTHER = {
+    "reference": (0.02, 0.001, 0.002),
+    "depth": (0.0, 0.007, 0.021),
+    "appearance": (0.0, 0.007, 0.0),
+    "mapping": (0.0, 0.01, 0.013),
+    "propagate": (0.0, 0.005, 0.022),
+    "seed": (0.0, 0.01, 0.017),
+}
+PER_STEP = (0.0, 0.03452)  # s of refinement: constant, for each million pixels of a view
+MEMORY_MB = (225.0, 52.0, 784.0)  # constant, for each million pixels of all views, for each million Gaussians
 
 
 @dataclass(frozen=True)
@@ -38,19 +53,19 @@ def forecast_removal(
     preset: str = "balanced",
 ) -> Forecast:
     """What a removal will roughly take; of what it finds to fill nothing is known yet, so all rounds count."""
-    megapixels, millions = pixels / 1e6, gaussians / 1e6
-    cost = {
-        name: PER_STAGE.get(name, 0) + PER_MEGAPIXEL.get(name, 0) * megapixels for name in ("read", "masks", *ROUND)
-    }
-    cost["masks"] += PER_MILLION_VIEWED * millions * views
-    stages = {name: cost[name] for name in ("read", "masks")}
-    for round_ in range(1, 1 + ROUNDS.get(preset, 1)):
-        stages |= {name if round_ == 1 else f"{name} {round_}": cost[name] for name in ROUND}
+    work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
+    stages = {name: _sum(cost, work) for name, cost in FIRST.items()}
+    for round_ in range(2, 1 + ROUNDS.get(preset, 1)):
+        stages |= {f"{name} {round_}": _sum(cost, work) for name, cost in FURTHER.items()}
     steps = STEPS.get(preset, 0)
     if steps:
-        stages["refine"] = PER_STEP * steps
-    memory_mb = BASE_MB + MB_PER_MEGAPIXEL * megapixels + MB_PER_MILLION * millions + (REFINE_MB if steps else 0.0)
+        stages["refine"] = steps * _sum(PER_STEP, (1.0, pixels / 1e6 / max(1, views)))
+    memory_mb = _sum(MEMORY_MB, (1.0, pixels / 1e6, gaussians / 1e6))
     return Forecast(stages, memory_mb)
+
+
+def _sum(costs: tuple[float, ...], work: tuple[float, ...]) -> float:
+    return sum(c * w for c, w in zip(costs, work, strict=True))
 
 
 @dataclass

@@ -47,16 +47,15 @@ def orbit_cameras(
         raise BadInput(f"orbit: an image of {width}×{height} pixels makes no sense")
     if not region:
         raise BadInput("orbit: no region to look at; give at least one box")
-    axis /= np.linalg.norm(axis)
+    axis = _unit(axis)
     corners = np.concatenate([box.corners() for box in region])
     centre = (corners.min(0) + corners.max(0)) / 2
-    radius = float(np.linalg.norm(corners - centre, axis=1).max())
+    radius = math.sqrt(((corners - centre) ** 2).sum(1).max())
     focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
     half_picture = FILL * min(width, height) / 2
     # where a sphere's outline has that size; unlike size · focal / pixels it stays outside the sphere with wide lenses
     distance = radius * math.hypot(1, focal / half_picture)
-    side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
-    side /= np.linalg.norm(side)
+    side = _unit(np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0]))
     front = np.cross(axis, side)
     cameras = []
     for k in range(count):
@@ -71,6 +70,7 @@ def orbit_cameras(
 def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     """The unit normal, towards the region, of the floor under it; None where no plane is found that it stands clear of.
 
+    It has six decimals, which is more than a floor has, and the same with every LAPACK.
     RANSAC (Fischler & Bolles 1981) with a fixed seed over the solid Gaussians round the region. Of the planes that hold
     at least half as many as the best one the nearest is the floor: an object touches it rather than the walls.
     """
@@ -102,7 +102,7 @@ def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     best = large[np.argmin(np.abs(lowest[large]))]
     on = points[np.abs(points @ normals[best] - offsets[best]) < FLAT]
     normal = np.linalg.svd(on - on.mean(0), full_matrices=False)[2][2]
-    return normal * (1.0 if normal @ normals[best] > 0 else -1.0)
+    return np.round(normal * (1.0 if normal @ normals[best] > 0 else -1.0), 6)
 
 
 def look_at(
@@ -111,10 +111,14 @@ def look_at(
     up: np.ndarray,  # [3], not along the view
 ) -> np.ndarray:
     """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
+    forward = _unit(target - eye)
+    right = _unit(np.cross(forward, up))
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+    matrix[:3, :3], matrix[:3, 3] = rotation, -(rotation * eye).sum(1)
     return matrix
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    """Without BLAS, whose last bits differ between NumPys: Blender's and the command's orbits are the same."""
+    return vector / math.sqrt((vector * vector).sum())

@@ -45,6 +45,7 @@ class RunsChild:
 
     running: RunsChild | None = None  # the one that runs beside Blender now; two would fight for the processor
     worker: Worker
+    in_window = False  # the user pressed a button: Blender must stay free. Else a script waits for the end
     _shown = ""
 
     def start(self, context: bpy.types.Context) -> Worker:
@@ -68,6 +69,10 @@ class RunsChild:
             self.worker = self.start(context)
         except FAILURES as error:
             return self._failed(error)
+        if self.in_window:
+            self._go(context)
+            context.window_manager.modal_handler_add(self)
+            return {"RUNNING_MODAL"}
         answer = AGAIN
         while answer == AGAIN:
             self.worker.join()
@@ -75,15 +80,12 @@ class RunsChild:
         return answer
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if bpy.app.background or RunsChild.running is not None:
-            return self.execute(context)
-        try:
-            self.worker = self.start(context)
-        except FAILURES as error:
-            return self._failed(error)
-        self._go(context)
-        context.window_manager.modal_handler_add(self)
-        return {"RUNNING_MODAL"}
+        self.in_window = not bpy.app.background
+        return self.ask(context, event)
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """What comes first in the window: a file browser or a dialogue, which calls `execute` in the end."""
+        return self.execute(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if event.type == "ESC":

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import bpy
-from bpy.props import BoolProperty
 
 from gimp3d.errors import BadInput
 
@@ -16,28 +15,29 @@ from ..properties import GIMP3D_preferences, preferences
 from ..worker import Worker, child_command, own_python
 from .base import RunsChild, python_of
 
-LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "zstandard")
-SIZES = ("about 170 MB to download, 650 MB on disk", "about 400 MB to download, 1.5 GB on disk")
-TORCH_INDEX = "https://download.pytorch.org/whl/cpu"  # PyPI's own brings 2 GB of CUDA along on Linux
+LIBRARIES = (  # as in pyproject.toml, which is not in the zip
+    "numpy>=1.26,<3",
+    "scipy>=1.11,<2",
+    "numba>=0.61,<1",
+    "opencv-contrib-python-headless>=4.8,<6",
+    "zstandard>=0.22,<1",
+)
+SIZE = "about 190 MB to download, 650 MB on disk"  # on Linux: scripts/environment_size.py measures it
 MAKE = """
 import json, subprocess, sys, venv
-folder, python, torch_index, *libraries = sys.argv[1:]
-say = lambda done, what: print(json.dumps({"stage": what, "done": done, "total": 3}), flush=True)
+folder, python, *libraries = sys.argv[1:]
+say = lambda done, what: print(json.dumps({"stage": what, "done": done, "total": 2}), flush=True)
 say(0, "making the environment")
 venv.create(folder, with_pip=True, clear=True)
-pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
 say(1, "installing the libraries")
-code = subprocess.run([*pip, *libraries]).returncode
-if torch_index and not code:
-    say(2, "installing PyTorch")
-    code = subprocess.run([*pip, "torch", "--index-url", torch_index]).returncode
-sys.exit(code)
+pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+sys.exit(subprocess.run([*pip, *libraries]).returncode)
 """
 CHECK = """
 import importlib, json, sys
 sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
 found = {"python": sys.version.split()[0]}
-for name in ("numpy", "scipy", "numba", "cv2", "zstandard", "torch"):
+for name in ("numpy", "scipy", "numba", "cv2", "zstandard"):
     try:
         found[name] = importlib.import_module(name).__version__
     except Exception as error:
@@ -45,7 +45,7 @@ for name in ("numpy", "scipy", "numba", "cv2", "zstandard", "torch"):
 print(json.dumps({"stage": "done", "summary": found}))
 """
 NEEDED = ("numpy", "scipy", "numba", "cv2")
-USES = {"zstandard": "for newer .spz files", "torch": "refines the new splats"}
+USES = {"zstandard": "for newer .spz files"}
 
 
 def environment_folder() -> Path:
@@ -66,37 +66,25 @@ class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
     bl_idname = "gimp3d.make_environment"
     bl_label = "Make Environment"
 
-    torch: BoolProperty(
-        name="With PyTorch",
-        default=True,
-        description="Refines the new splats; without it the presets Balanced and Best leave them as Draft does",
-    )
-
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Enable the extension first")
         return preferences(context) is not None and RunsChild.running is None
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=420, confirm_text="Download and Install")
 
     def draw(self, context: bpy.types.Context) -> None:
-        self.layout.label(text=f"Downloads {', '.join(LIBRARIES)}")
-        self.layout.label(text=f"from PyPI: {SIZES[self.torch]}.")
+        self.layout.label(text=f"Downloads {', '.join(library.split('>')[0] for library in LIBRARIES)}")
+        self.layout.label(text=f"from PyPI: {SIZE}.")
         self.layout.label(text=str(environment_folder()))
-        self.layout.prop(self, "torch")
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """After the dialogue's OK: beside Blender in the window, waiting in scripts."""
-        return RunsChild.execute(self, context) if bpy.app.background else RunsChild.invoke(self, context, None)
 
     def start(self, context: bpy.types.Context) -> Worker:
         if not bpy.app.online_access:
             raise BadInput("Blender is set to stay offline; allow it in Preferences › System › Network")
         folder = environment_folder()
         self._python = environment_python(folder)
-        index = TORCH_INDEX if self.torch else ""
-        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), index, *LIBRARIES])
+        return Worker([], command=[own_python(), "-c", MAKE, str(folder), str(self._python), *LIBRARIES])
 
     def collect(self, context: bpy.types.Context) -> None:
         self.worker.result()

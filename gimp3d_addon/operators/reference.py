@@ -220,8 +220,8 @@ class GIMP3D_OT_export_reference(RunsReference, bpy.types.Operator, ExportHelper
     bl_label = "Export Reference"
     filename_ext = ".png"
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        return ExportHelper.invoke(self, context, event)  # the file browser first; then execute waits
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return ExportHelper.invoke(self, context, event)
 
     def deliver(self, context: bpy.types.Context, picture: Path, mask: Path) -> None:
         target = Path(bpy.path.abspath(self.filepath))

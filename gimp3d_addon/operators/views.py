@@ -31,8 +31,8 @@ def add_cameras(
     context.scene.collection.children.link(collection)
     frame = Matrix(bridge.splat_frame(splat).tolist())
     apart = np.std([c.centre for c in cameras], axis=0).max() * frame.median_scale
-    for camera in cameras:
-        obj = bridge.camera_to_blender(camera, frame)
+    for number, camera in enumerate(cameras):
+        obj = bridge.camera_to_blender(camera, frame, number)
         if len(cameras) > 1:
             obj.data.display_size = max(1e-6, DISPLAY_SHARE * apart)
         link(context, obj, collection)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,7 +61,7 @@ def test_the_environment_is_made_and_used(
     monkeypatch.setattr(environment, "bpy", SimpleNamespace(app=app))
     monkeypatch.setattr(environment, "environment_folder", lambda: tmp_path / "env")
     monkeypatch.setattr(environment, "LIBRARIES", ("pip",))
-    assert bpy.ops.gimp3d.make_environment(torch=False) == {"FINISHED"}
+    assert bpy.ops.gimp3d.make_environment() == {"FINISHED"}
     assert Path(preferences.python).exists() and str(tmp_path / "env") in preferences.python
     assert environment.environment_python(tmp_path / "env") == Path(preferences.python)
 
@@ -73,14 +74,19 @@ def test_a_download_that_fails_is_said_and_changes_nothing(
     monkeypatch.setattr(environment, "environment_folder", lambda: tmp_path / "env")
     monkeypatch.setattr(environment, "LIBRARIES", (str(tmp_path / "no such folder"),))
     with pytest.raises(RuntimeError, match="gimp3d: error: "):
-        bpy.ops.gimp3d.make_environment(torch=False)
+        bpy.ops.gimp3d.make_environment()
     assert preferences.python == ""
+
+
+def test_the_button_installs_what_the_library_declares() -> None:
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    assert list(environment.LIBRARIES) == project["dependencies"]
 
 
 def test_the_dialogue_names_the_sizes() -> None:
     said: list[str] = []
     layout = SimpleNamespace(label=lambda text: said.append(text), prop=lambda *_: None)
-    GIMP3D_OT_make_environment.draw(SimpleNamespace(layout=layout, torch=False), bpy.context)
+    GIMP3D_OT_make_environment.draw(SimpleNamespace(layout=layout), bpy.context)
     assert any("MB" in line for line in said) and any("numba" in line for line in said)
 
 

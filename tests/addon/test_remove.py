@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
+import shutil
 import time
 from pathlib import Path
 
@@ -63,23 +63,29 @@ def test_remove_makes_a_new_object_hides_the_source_and_restores(folder: Path) -
     assert bpy.context.scene.gimp3d.splat == splat and not splat.hide_get()
 
 
-def test_blender_and_the_shell_give_the_same_scene(folder: Path) -> None:
-    prepare(folder)
+def shell(folder: Path, out: str) -> bytes:
+    """What the command makes of the folder's own files."""
+    given = [str(folder / name) for name in ("scene.ply", "transforms.json", "roi.json", out)]
+    options = ["--cameras", given[1], "--roi", given[2], "--out", given[3], "--images", "none", "--progress", "none"]
+    assert main(["remove", given[0], *options]) == 0
+    return Path(given[3]).read_bytes()
+
+
+@pytest.mark.parametrize("up", [None, *splats.UP_AXES], ids=str)
+def test_blender_and_the_shell_give_the_same_bytes(folder: Path, up: str | None) -> None:
+    """From the same numbers, also where the object stands upright in Blender and not in its file."""
+    write_transforms(folder / "transforms.json", cameras()[::-1])  # views keep the file's order
+    prepare(folder, splats.UP_AXES[up] if up else None)
     bpy.ops.gimp3d.remove_object()
     bpy.ops.gimp3d.export_ply(filepath=str(folder / "blender.ply"))
-    arguments = [
-        "remove",
-        "scene.ply",
-        "--cameras",
-        "transforms.json",
-        "--roi",
-        "roi.json",
-        "--out",
-        "shell.ply",
-    ]
-    paths = [str(folder / a) if re.search(r"\.\w+$", a) else a for a in arguments]
-    assert main([*paths, "--images", "none", "--progress", "none"]) == 0
-    same_picture(folder / "blender.ply", folder / "shell.ply")
+    (job,) = (folder / "gimp3d_jobs").iterdir()
+    told = {"center": REGION[0].center.tolist(), "size": REGION[0].size.tolist(), "rotation_wxyz": [1, 0, 0, 0]}
+    assert json.loads((job / "roi.json").read_text()) == [told]
+    assert (folder / "blender.ply").read_bytes() == shell(folder, "shell.ply")
+    (job / "out.ply").unlink()
+    shutil.rmtree(job / "stages")
+    assert main(["remove", "--job", str(job), "--progress", "none"]) == 0
+    assert (job / "out.ply").read_bytes() == (folder / "shell.ply").read_bytes()
 
 
 def test_a_rotated_and_scaled_splat_object_gives_the_same_rows_and_pixels(folder: Path) -> None:

@@ -21,6 +21,7 @@ from ..gaussians import quats_to_matrices
 from ..job import write_atomically
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
+EXACT = "world_to_camera"  # our own key of a frame; counts only where transform_matrix says the same
 REFUSED = {
     "fisheye": {
         "OPENCV_FISHEYE",
@@ -91,7 +92,10 @@ def read_cameras(
 
 
 def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
-    """Write a nerfstudio transforms.json with exact intrinsics per frame. Written atomically."""
+    """Write a nerfstudio transforms.json with exact intrinsics per frame. Written atomically.
+
+    Beside nerfstudio's pose it holds the view matrix, as inverting twice does not give every last bit back.
+    """
     frames = []
     for c in cameras:
         d = c.distortion or Distortion()
@@ -111,6 +115,7 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
                 "p2": d.p2,
                 "k3": d.k3,
                 "transform_matrix": (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist(),
+                EXACT: c.viewmat.tolist(),
             }
         )
     document = {"camera_model": "OPENCV", "frames": frames}
@@ -146,13 +151,31 @@ def rigid(
         m = np.vstack([m, [0, 0, 0, 1]])
     if m.shape != (4, 4) or not np.isfinite(m).all():
         raise BadInput(f"{where}: the pose is not a finite 4×4 matrix")
-    u, s, vt = np.linalg.svd(m[:3, :3])
+    s = np.linalg.svd(m[:3, :3], compute_uv=False)
     if s[2] < 1e-9 or s[0] / s[2] > 1.001:
         raise BadInput(f"{where}: the pose is sheared or flat; only rotation, translation and uniform scale are poses")
-    rotation = u @ vt
-    if np.linalg.det(rotation) < 0:
+    if np.linalg.det(m[:3, :3]) < 0:
         raise BadInput(f"{where}: the pose mirrors the scene")
-    return np.block([[rotation, m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+    return np.block([[_nearest_rotation(m[:3, :3]), m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def _nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """The rotation in a rotation with uniform scale [3, 3]: Newton's iteration X ← (X + X⁻ᵀ) / 2 (Higham 1986).
+
+    In products and sums of single numbers, as LAPACK's last bits differ between NumPys and Blender has its own.
+    """
+    x = linear / np.sqrt((linear**2).sum() / 3)
+    for _ in range(6):  # quadratic from 1e-3 on
+        cofactors = np.cross(x[[1, 2, 0]], x[[2, 0, 1]])
+        x = (x + cofactors / (x[0] * cofactors[0]).sum()) / 2
+    return x
+
+
+def _inverted(pose: np.ndarray) -> np.ndarray:
+    """A rigid pose [4, 4] the other way round, to the same bits with every NumPy."""
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -(pose[:3, :3] * pose[:3, 3:]).sum(0)
+    return inverse
 
 
 def make_camera(
@@ -221,13 +244,23 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
         extra = [k for k in ("k4", "k5", "k6") if both.get(k)]
         if extra:
             raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        viewmat = np.linalg.inv(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV)
+        viewmat = _exactly(_inverted(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV), frame.get(EXACT))
         distortion = _distortion([both.get(c, 0.0) for c in ("k1", "k2", "p1", "p2", "k3")], where)
         split = both.get("split", "train")
         if split not in ("train", "test"):
             raise BadInput(f"{where}: split must be train or test, got {split!r}")
         cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, split, photo))
     return tuple(cameras)
+
+
+def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
+    """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
+    try:
+        exact = np.array(told, dtype=np.float64)
+    except (TypeError, ValueError):
+        return viewmat
+    same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
+    return exact if same else viewmat
 
 
 def _transforms_intrinsics(both: dict[str, Any], photo: Path, where: str) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
@@ -284,7 +317,7 @@ def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[C
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers") from None
         name = camera_id(entry["img_name"], where)
         size = (entry["width"], entry["height"])
-        viewmat = np.linalg.inv(rigid(pose, where))
+        viewmat = _inverted(rigid(pose, where))
         try:
             centre = (float(size[0]) / 2, float(size[1]) / 2)
         except (TypeError, ValueError):

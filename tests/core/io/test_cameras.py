@@ -222,3 +222,31 @@ def test_real_cameras_agree_between_formats(shared_data: Path) -> None:
         other = by_name[camera.id.rsplit("/")[-1]]
         np.testing.assert_allclose(camera.viewmat, other.viewmat, atol=1e-6)
         np.testing.assert_allclose(camera.K, other.K, atol=1e-6)
+
+
+@pytest.mark.parametrize("reach", [1.0, 1e6])
+def test_a_written_pose_is_read_to_the_last_bit(reach: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    views = []
+    for k in range(20):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        viewmat[:3, :3] *= np.linalg.det(viewmat[:3, :3])
+        viewmat[:3, 3] = reach * rng.normal(size=3)
+        views.append(Camera(f"{k}", 64, 48, 50.0, 50.0, 32.0, 24.0, viewmat))
+    write_transforms(tmp_path / "t.json", views)
+    back = read_cameras(tmp_path / "t.json")
+    assert all((a.viewmat == b.viewmat).all() for a, b in zip(views, back))
+
+
+def test_a_pose_that_another_program_changed_counts(views: tuple[Camera, ...], tmp_path: Path) -> None:
+    write_transforms(tmp_path / "t.json", views)
+    document = json.loads((tmp_path / "t.json").read_text())
+    pose = np.array(document["frames"][0]["transform_matrix"])
+    pose[0, 3] += 1e-6
+    document["frames"][0]["transform_matrix"] = pose.tolist()
+    document["frames"][1]["world_to_camera"] = "nonsense"
+    (tmp_path / "t.json").write_text(json.dumps(document))
+    back = read_cameras(tmp_path / "t.json")
+    assert back[0].centre[0] == pytest.approx(views[0].centre[0] + 1e-6, abs=1e-12)
+    assert np.allclose(back[1].viewmat, views[1].viewmat, atol=1e-12)
