@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-ROUNDS = {"draft": 3, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
+ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
 ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view

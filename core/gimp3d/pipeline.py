@@ -82,7 +82,7 @@ class RemovalSettings:
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(extra_references=2, extra_gain=0.02),
+    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
     "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
     "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 R = TypeVar("R")
 
+SMALL = 300_000  # pixels of a picture, see at_once
 _lock = threading.Lock()
 _inside = threading.local()  # marks pool threads: nested calls run inline instead of waiting for their own pool
 _pool: ThreadPoolExecutor | None = None
@@ -55,12 +56,32 @@ def _executor() -> ThreadPoolExecutor:
         return _pool
 
 
-def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def at_once(pixels: int) -> int | None:
+    """How many pictures of so many pixels are worked on at once by NumPy and OpenCV: 2, or all threads.
+
+    Small ones take so little time per call that more than two threads spend theirs on passing on Python's lock.
+    """
+    return 2 if pixels < SMALL else None
+
+
+def parallel_map(
+    function: Callable[[T], R],
+    items: Iterable[T],
+    most: int | None = None,  # at a time
+) -> list[R]:
     """[function(x) for x in items], in order, on the pool; the first exception is raised."""
     items = list(items)
     if thread_count() == 1 or len(items) < 2:
         return [function(x) for x in items]
-    return list(_executor().map(function, items))
+    if most is None or most >= thread_count():
+        return list(_executor().map(function, items))
+    left = iter(enumerate(items))  # next() on it is one step for Python's threads
+
+    def take(_: int) -> list[tuple[int, R]]:
+        return [(k, function(x)) for k, x in left]
+
+    found = dict(pair for part in _executor().map(take, range(most)) for pair in part)
+    return [found[k] for k in range(len(items))]
 
 
 def run_ranges(kernel: Callable[..., Any], count: int, *args: Any, chunk: int = 0) -> None:

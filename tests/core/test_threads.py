@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -40,5 +41,29 @@ def test_the_thread_count_can_be_set() -> None:
         set_thread_count(2)
         names = set(parallel_map(lambda _: threading.current_thread().name, range(40)))
         assert thread_count() == 2 and len(names) <= 2
+    finally:
+        set_thread_count(None)
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_no_more_at_a_time_than_asked_for(most: int) -> None:
+    lock, now, peak = threading.Lock(), 0, 0
+
+    def work(x: int) -> int:
+        nonlocal now, peak
+        with lock:
+            now += 1
+            peak = max(peak, now)
+        time.sleep(0.001)
+        with lock:
+            now -= 1
+        return -x
+
+    try:
+        set_thread_count(4)
+        assert parallel_map(work, range(40), most) == [-x for x in range(40)]
+        assert peak <= most
+        with pytest.raises(ZeroDivisionError):
+            parallel_map(lambda x: 1 // x, [1, 0, 2], most)
     finally:
         set_thread_count(None)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel
-from ..threads import parallel_map
+from ..threads import at_once, parallel_map
 from .layers import steps
 from .masks import ViewMasks
 
@@ -55,7 +55,7 @@ def gather_depth_evidence(
     """
     others = [v for v in views if v.camera.id != view.camera.id]
     asked = view.target if ring is None else view.target | ring
-    samples = parallel_map(lambda v: _samples(v, view, asked, settings), others)
+    samples = parallel_map(lambda v: _samples(v, view, asked, settings), others, at_once(asked.size))
     h, w = view.target.shape
     found, count = np.zeros(h * w), np.zeros(h * w)
     pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)

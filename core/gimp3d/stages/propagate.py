@@ -20,7 +20,7 @@ from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
 from ..solvers.colours import NO_CHANGE, ColourChange, exposure_gain, learn_change
 from ..solvers.poisson import solve_poisson
-from ..threads import parallel_map, run_ranges
+from ..threads import at_once, parallel_map, run_ranges
 
 TRANSFERS = ("learned", "sample", "none")
 BLENDS = ("band", "rim")
@@ -181,7 +181,7 @@ def propagate(
         progress("propagate", done, len(views), view.camera.id)
         return painted
 
-    painted = tuple(parallel_map(paint, views))
+    painted = tuple(parallel_map(paint, views, at_once(reference.target.size)))
     counts = sum((np.bincount(p.rules.ravel(), minlength=len(Rule)) for p in painted), np.zeros(len(Rule), int))
     total = max(1, counts[1:].sum())
     shares = ", ".join(f"{counts[r] / total:.0%} {r.name.lower().replace('_', ' ')}" for r in list(Rule)[1:])

@@ -16,7 +16,9 @@ from ..threads import parallel_map
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks, sees
 
-PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000))  # where the hidden surface is, about
+PROVISIONAL = DepthSettings(
+    plate=ThinPlateSettings(unknowns=1000), small_part=300
+)  # where the hidden surface is, about
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,7 @@ def needed_surface(
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
     seeing = [v for v in views if v.target.sum() >= settings.minimum_pixels]
     step = max(1, -(-len(seeing) // settings.surface_views))
-    parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step])
+    parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
         return NeededSurface(points, normals)
@@ -175,7 +177,11 @@ def choose_reference(
         If the wanted view does not see the hole, or no view does.
     """
     surface = needed_surface(views, solid, settings)
-    seen = parallel_map(lambda v: _seen(v, surface) if v.target.sum() >= settings.minimum_pixels else None, views)
+
+    def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
+        return _seen(view, surface) if view.target.sum() >= settings.minimum_pixels else None
+
+    seen = parallel_map(shown_in, views, most=2)
     untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
     candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and _has_rim(v, solid)]
     if not candidates:
