@@ -2,7 +2,7 @@
 
 Stages the manifest, the add-on and the wheels, and lets Blender's own builder make and validate the zips: one for each
 platform, with wheels for both Pythons that Blender carries; Blender installs those that fit. NumPy is never bundled, as
-Blender brings its own, nor is PyTorch, which is too large: the preferences make an environment that has it.
+Blender brings its own.
 
     python scripts/build_extension.py [--platform linux-x64] … [--without-compiled-wheels]
 """

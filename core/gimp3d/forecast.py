@@ -13,25 +13,25 @@ ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 FIRST = {
-    "read": (0.052, 0.184, 0.387),
-    "masks": (0.565, 0.159, 0.258),
-    "reference": (0.191, 0.0, 0.247),
-    "depth": (0.034, 0.037, 0.063),
-    "appearance": (0.0, 0.02, 0.149),
-    "mapping": (0.029, 0.044, 0.0),
-    "propagate": (0.184, 0.064, 0.187),
-    "seed": (0.033, 0.024, 0.038),
+    "read": (0.234, 0.081, 0.135),
+    "masks": (0.428, 0.099, 0.093),
+    "reference": (0.126, 0.009, 0.078),
+    "depth": (0.0, 0.032, 0.051),
+    "appearance": (0.088, 0.023, 0.018),
+    "mapping": (0.003, 0.03, 0.006),
+    "propagate": (0.184, 0.036, 0.073),
+    "seed": (0.053, 0.007, 0.018),
 }
 FURTHER = {
-    "reference": (0.02, 0.001, 0.002),
-    "depth": (0.0, 0.007, 0.021),
+    "reference": (0.0, 0.009, 0.019),
+    "depth": (0.0, 0.015, 0.005),
     "appearance": (0.0, 0.007, 0.0),
-    "mapping": (0.0, 0.01, 0.013),
-    "propagate": (0.0, 0.005, 0.022),
-    "seed": (0.0, 0.01, 0.017),
+    "mapping": (0.0, 0.014, 0.009),
+    "propagate": (0.0, 0.008, 0.024),
+    "seed": (0.0, 0.008, 0.014),
 }
-PER_STEP = (0.0, 0.03452)  # s of refinement: constant, for each million pixels of a view
-MEMORY_MB = (225.0, 52.0, 784.0)  # constant, for each million pixels of all views, for each million Gaussians
+PER_STEP = (0.0, 0.03323)  # s of refinement: constant, for each million pixels of a view
+MEMORY_MB = (208.0, 59.0, 795.0)  # constant, for each million pixels of all views, for each million Gaussians
 
 
 @dataclass(frozen=True)
