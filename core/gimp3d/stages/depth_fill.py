@@ -28,7 +28,7 @@ class DepthSettings:
     evidence: DepthEvidenceSettings = DepthEvidenceSettings()
     plane_share: float = 0.65  # of the ring that must lie on planes
     tolerances: tuple[float, ...] = (1.0, 2.0, 4.0)  # of planes.inlier, tried until so much does
-    plane_trust: float = 1.1  # planes are taken if they miss a withheld band by this many times a plate's miss
+    plane_trust: float = 1.4  # planes are taken if they miss a withheld band by this many times a plate's miss
     smoothing: float = 12.0  # σ of the average of what the ring deviates from a plane
     skin: float = 1.5  # width of the part of the ring next to the hole that the object's haze bends
     withheld: int = 12  # width of the band by which planes and plate are compared
