@@ -87,7 +87,10 @@ def _from_compressed_ply(path: Path) -> Gaussians:
     header, data = header_of(path), path.read_bytes()
     tables, offset = {}, header.size
     for element in header.elements:
-        kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+        try:
+            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+        except ValueError as error:  # two properties of one name
+            raise BadInput(f"{path}: a damaged compressed PLY ({error})") from None
         if offset + element.count * kind.itemsize > len(data):
             raise BadInput(f"{path} is truncated: element {element.name} is not whole")
         tables[element.name] = np.frombuffer(data, kind, element.count, offset)
@@ -177,7 +180,7 @@ def _unpacked_spz_4(data: bytes, path: Path) -> bytes:
         try:
             unpacker = zstandard.ZstdDecompressor()
             body.append(unpacker.decompress(data[offset : offset + packed], max_output_size=unpacked))
-        except zstandard.ZstdError as error:
+        except (zstandard.ZstdError, MemoryError) as error:  # a frame may claim any size
             raise BadInput(f"{path} is damaged ({error})") from None
         offset += packed
     return b"".join(body)

@@ -297,6 +297,19 @@ def test_a_damaged_byte_is_a_scene_or_one_clear_line(tmp_path: Path, name: str, 
         assert "\n" not in str(error)
 
 
+def test_a_property_that_comes_twice_is_said(tmp_path: Path) -> None:
+    for name, twice in (("a.compressed.ply", (b"min_scale_x", b"max_scale_x")), ("a.ply", (b"scale_0", b"scale_1"))):
+        path = tmp_path / name
+        if name in WRITERS:
+            WRITERS[name](path, some(40))
+        else:
+            write_gaussians(path, some(40))
+        path.write_bytes(path.read_bytes().replace(*twice, 1))
+        with pytest.raises(BadInput, match="more than once|twice") as error:
+            read_scene(path)
+        assert "\n" not in str(error.value)
+
+
 def test_what_is_no_scene_is_said(tmp_path: Path) -> None:
     for name, data, words in [
         ("a.txt", b"hello there", "not a PLY, nor"),
