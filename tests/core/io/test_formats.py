@@ -305,7 +305,7 @@ def test_a_property_that_comes_twice_is_said(tmp_path: Path) -> None:
         else:
             write_gaussians(path, some(40))
         path.write_bytes(path.read_bytes().replace(*twice, 1))
-        with pytest.raises(BadInput, match="more than once|twice") as error:
+        with pytest.raises(BadInput, match=r"more than once|twice") as error:
             read_scene(path)
         assert "\n" not in str(error.value)
 
