@@ -50,8 +50,9 @@ def test_tables_and_chart_show_references_that_were_refused() -> None:
     assert "1.41" in {t.text for t in drawn.iter("{http://www.w3.org/2000/svg}text")}
 
 
-def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), str(tmp_path), "--quick", "--out", str(tmp_path / "out")]
+@pytest.mark.parametrize("script", [SCRIPT, SCRIPT.with_name("bench_stability.py")], ids=lambda s: s.stem)
+def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path, script: Path) -> None:
+    command = [sys.executable, str(script), str(tmp_path), "--quick", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "has no truth/" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -64,18 +64,19 @@ def photographed(wrong: dict[str, np.ndarray]) -> RemovalResult:
 
 
 PICTURES = {c.id: PHOTOS[c.id] for c in OTHERS}
-# What is wrong, and by how many dB the result may be worse than without. Each is about twice what was measured.
+# What is wrong, and by how many dB the result may be worse than without. Each is 0.5 to 3.7 dB above what was measured.
+# Fewer views are not worse here: they leave more of the hole to the reference, whose picture is the true one.
 CASES: dict[str, tuple[Callable[[], RemovalResult], Callable[[], AbstractContextManager[None]], float]] = {
-    "one view": (lambda: removed((REFERENCE,)), nullcontext, 3),
-    "two views 1° apart": (lambda: near(1.0, OTHERS[:1]), nullcontext, 3),
-    "all views within 10°": (lambda: near(10.0), nullcontext, 3),
+    "one view": (lambda: removed((REFERENCE,)), nullcontext, 1),
+    "two views 1° apart": (lambda: near(1.0, OTHERS[:1]), nullcontext, 1),
+    "all views within 10°": (lambda: near(10.0), nullcontext, 1),
     "exposures off by 20 %": (lambda: photographed(exposed(PICTURES, 0.2, 0)), nullcontext, 0.5),
-    "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 12),
-    "a tenth of all pixels wrong": (lambda: photographed(garbled(PICTURES, 0.1, 0)), nullcontext, 3),
-    "surface off by 1 %": (removed, partial(noisy_surfaces, 0.01, 0), 4),
+    "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 8),
+    "a tenth of all pixels wrong": (lambda: photographed(garbled(PICTURES, 0.1, 0)), nullcontext, 1),
+    "surface off by 1 %": (removed, partial(noisy_surfaces, 0.01, 0), 3),
     "surface off by 10 %": (removed, partial(noisy_surfaces, 0.1, 0), 18),
-    "all depths off by 1 %": (removed, partial(noisy_depths, 0.01, 0), 3),
-    "all depths off by 10 %": (removed, partial(noisy_depths, 0.1, 0), 20),
+    "all depths off by 1 %": (removed, partial(noisy_depths, 0.01, 0), 1),
+    "all depths off by 10 %": (removed, partial(noisy_depths, 0.1, 0), 17),
 }
 
 
@@ -148,13 +149,6 @@ def test_table_and_chart_show_what_was_refused() -> None:
     assert "| 20.00 |" in words and "| NO |" in words and "| sees no hole |" in words and "| careful |" in words
     drawn = ElementTree.fromstring(draw_chart(results))
     assert {"Surface off, %", "10", "3"} <= {t.text for t in drawn.iter("{http://www.w3.org/2000/svg}text")}
-
-
-def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), str(tmp_path), "--quick", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "has no truth/" in done.stderr
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
