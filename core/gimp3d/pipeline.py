@@ -21,6 +21,8 @@ from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
+from .stages.charts import Chart, ChartSettings, Hits, Plane, draw_charts, find_planes
+from .stages.clearing import ClearingSettings, Targets, by_charts, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
@@ -55,6 +57,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
+from .stages.witness import Witness
 from .threads import parallel_map
 
 R = TypeVar("R")
@@ -66,6 +69,8 @@ class RemovalSettings:
     """Every stage's settings, and the providers of what no view shows."""
 
     masks: MaskSettings = MaskSettings()
+    charts: ChartSettings | None = ChartSettings()  # None: photos are the only references (paper)
+    clearing: ClearingSettings = ClearingSettings()
     reference: ReferenceSettings = ReferenceSettings()
     evidence: EvidenceSettings = EvidenceSettings()
     depth: DepthSettings = DepthSettings()
@@ -87,6 +92,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
+        charts=None,
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
@@ -142,6 +148,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
+    charts: tuple[Chart, ...] = ()
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
@@ -221,52 +228,75 @@ def remove_object(
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
     run.warnings += masks.warnings
-    keep = ~masks.removed
-    for v in _spread(masks.views):
-        run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if not masks.removed.any():
-        return _finish(run, keep, None, masks, {}, ["nothing to remove: the region holds no Gaussian"])
+        none = ["nothing to remove: the region holds no Gaussian"]
+        return _finish(run, ~masks.removed, None, masks, (), {}, none)
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    kept = scene.take(~masks.removed)
+
+    def level(v: ViewMasks) -> Exposure:
+        """A view's photo at the splats' exposure."""
+        ring = exposure_ring(v)
+        return level_exposure(ring, photos[v.camera.id], render_bytes(kept, v.camera, pixels=ring))
+
+    exposures = dict(zip((v.camera.id for v in masks.views), parallel_map(level, masks.views)))
+    levelled = {name: e.image for name, e in exposures.items()}
+    open_views = masks.views
+    hits: dict[str, Hits] = {}
+    charts: tuple[Chart, ...] = ()
+    if settings.charts is not None and masks.mode == "need":
+        charted: Charted = run("charts", lambda: _chart(scene, region, masks, levelled, extra_masks or {}, settings))
+        if charted.charts:
+            charts, open_views = charted.charts, charted.targets.views
+            hits = {v.camera.id: h for v, h in zip(open_views, charted.targets.hits)}
+            masks = replace(masks, selection=charted.selection, views=open_views)
+    keep = ~masks.removed
+    kept = scene.take(keep)
+    for v in _spread(open_views):
+        run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if masks.hole_pixels == 0:
         why = "nothing to fill: every view sees what is behind the object"
         if masks.mode == "paper":
             why = "nothing to fill: what surrounds the box covers its outline in every view"
-        return _finish(run, keep, None, masks, {}, [why])
-    kept = scene.take(keep)
+        return _finish(run, keep, None, masks, charts, {}, [why])
 
-    def emptied(v: ViewMasks) -> tuple[Exposure, np.ndarray]:
-        """A view's photo at the splats' exposure, and with the emptied scene in the object's place."""
-        silhouette, ring = v.silhouette, exposure_ring(v)
-        drawn = render_bytes(kept, v.camera, pixels=silhouette | ring)
-        exposure = level_exposure(ring, photos[v.camera.id], drawn)
-        return exposure, np.where(silhouette[..., None], drawn, exposure.image)
+    def emptied(v: ViewMasks) -> np.ndarray:
+        """A view's photo with the emptied scene in the object's place."""
+        silhouette = v.silhouette
+        drawn = render_bytes(kept, v.camera, pixels=silhouette)
+        return np.where(silhouette[..., None], drawn, levelled[v.camera.id])
 
-    names = [v.camera.id for v in masks.views]
-    found = parallel_map(emptied, masks.views)
-    exposures, painted = {n: e for n, (e, _) in zip(names, found)}, {n: p for n, (_, p) in zip(names, found)}
-    del found
-    levelled = {name: e.image for name, e in exposures.items()}
+    painted = dict(zip((v.camera.id for v in open_views), parallel_map(emptied, open_views)))
     filled, added = kept, None
-    open_views = masks.views
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
-    for round_ in range(1 + settings.extra_references):
+    as_photo = [None] * (0 if charts else 1 + settings.extra_references)
+    sources: list[Chart | None] = [None] if charts and reference else []
+    for round_, chart in enumerate([*sources, *charts, *as_photo]):
         buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
+        suffix = "" if first else f" {round_ + 1}"
         try:
-            new, painting = _fill_from_one_view(
-                run,
-                "" if first else f" {round_ + 1}",
-                filled,
-                open_views,
-                levelled,
-                painted,
-                settings,
-                reference if first else None,
-                reference_image if first else None,
-            )
+            if chart is not None:
+                step = _fill_from_chart(run, suffix, chart, filled, open_views, hits, levelled, painted, settings)
+                if step is None:
+                    continue
+                new, painting = step
+            else:
+                new, painting = _fill_from_one_view(
+                    run,
+                    suffix,
+                    filled,
+                    open_views,
+                    hits,
+                    levelled,
+                    painted,
+                    settings,
+                    reference if first else None,
+                    reference_image if first else None,
+                )
         except IllPosed as error:
             touched = sum(int(v.silhouette.sum()) for v in masks.views)
             if first and masks.hole_pixels > NEGLIGIBLE * touched:
@@ -284,7 +314,7 @@ def remove_object(
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     buffers.release()
-    added = _refined(run, kept, added, masks, painted, told, settings)
+    keep, added = _refined(run, scene, keep, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
@@ -295,27 +325,159 @@ def remove_object(
         painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
 
     parallel_map(finish, masks.views)
-    return replace(_finish(run, keep, added, masks, painted, []), open_pixels=left)
+    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left)
+
+
+@dataclass(frozen=True)
+class Charted:
+    """The surfaces that the object hid, and what follows from them."""
+
+    charts: tuple[Chart, ...]
+    selection: Selection  # with what had to be cleared away
+    targets: Targets
+    confidence: float
+    reason: str
+
+
+def _chart(
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    photos: dict[str, np.ndarray],  # at the splats' exposure
+    extra: Mapping[str, np.ndarray],
+    settings: RemovalSettings,
+) -> Charted:
+    """Find the hidden surfaces, clear the air before them, and say where they have to be filled."""
+    assert settings.charts is not None
+    views = masks.views
+    marked = [extra.get(v.camera.id) for v in views]
+
+    def witnessed(selection: Selection) -> list[Witness]:
+        objects = object_pixels(scene, selection.removed, views, settings.clearing)
+        hidden = [o if m is None else o | m for o, m in zip(objects, marked)]
+        return [Witness(v.camera, photos[v.camera.id], h, v.depth_before) for v, h in zip(views, hidden)]
+
+    selection, witnesses = masks.selection, witnessed(masks.selection)
+    planes = find_planes(views, witnesses, region, settings.charts)
+    charts = draw_charts(planes, views, witnesses, region, settings.charts)
+    if charts:
+        chosen = by_charts(scene, region, selection, charts)
+        if chosen.removed.sum() > selection.removed.sum():
+            selection, witnesses = chosen, witnessed(chosen)
+            charts = draw_charts(planes, views, witnesses, region, settings.charts)
+    if not charts:
+        return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
+    tolerance = max(c.tolerance for c in charts)
+    selection = clear_air(scene, region, selection, views, witnesses, tolerance, settings.clearing)
+    targets = chart_targets(scene, selection, views, witnesses, charts, tolerance, marked, settings.clearing)
+    words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
+    cleared = int(selection.removed.sum() - masks.removed.sum())
+    return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
+
+
+def _fill_from_chart(
+    run: _Run,
+    suffix: str,
+    chart: Chart,
+    filled: Gaussians,
+    open_views: Sequence[ViewMasks],
+    hits: dict[str, Hits],
+    photos: dict[str, np.ndarray],
+    painted: dict[str, np.ndarray],
+    settings: RemovalSettings,
+) -> tuple[Gaussians, Propagation] | None:
+    """Complete one chart, carry it into every view, and make its Gaussians; None if no view needs it."""
+    number = int(chart.camera.id.rpartition(":")[2]) - 1
+    target = _needed_texels(chart, number, open_views, hits)
+    if not target.any():
+        return None
+    shown = (chart.photos > 0) & chart.there
+    hole = target & ~shown
+    appearance: Appearance = run(
+        f"appearance{suffix}",
+        lambda: inpaint_reference(
+            settings.inpaint,
+            chart.image,
+            hole,
+            settings.random_seed,
+            None if chart.kind == "plane" else disparity_of(chart.depth),
+            chart.camera.K,
+            ~shown & ~hole,
+        ),
+    )
+    source = ~target & shown
+
+    def to_paint(v: ViewMasks, _: Gaussians) -> ViewToPaint:
+        name, there = v.camera.id, hits[v.camera.id].depth
+        behind = (v.depth_after == 0) | (v.depth_after > (1 - chart.tolerance) * there)
+        return ViewToPaint(
+            v.camera,
+            photos[name],
+            painted[name],
+            v.silhouette,
+            v.target,
+            snapped(v.depth_before, there, chart.tolerance),
+            np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, chart.tolerance)),
+        )
+
+    return _carried(
+        run,
+        suffix,
+        chart.camera,
+        appearance,
+        chart.depth,
+        target,
+        source,
+        filled,
+        open_views,
+        to_paint,
+        painted,
+        settings,
+    )
+
+
+def snapped(
+    depth: np.ndarray,  # [H, W] z, 0 = nothing
+    there: np.ndarray,  # [H, W] z of a chart, 0 = none
+    tolerance: float,  # relative
+) -> np.ndarray:
+    """The depth, but the chart's where it is the chart's surface: splats' depths are rough, photos place charts."""
+    same = (there > 0) & (np.abs(depth - there) < tolerance * there)
+    return np.where(same, there, depth)
+
+
+def _needed_texels(chart: Chart, number: int, views: Sequence[ViewMasks], hits: dict[str, Hits]) -> np.ndarray:
+    """[H, W] bool: texels that the targets of some view meet."""
+    marked = np.zeros(chart.hole.shape, np.uint8)
+    for view in views:
+        met = hits[view.camera.id]
+        on = view.target & (met.chart == number)
+        marked[met.rows[on], met.cols[on]] = 1
+    # a view that looks on from the side or from afar has fewer pixels than the chart has texels
+    kernel = np.ones((5, 5), np.uint8)
+    closed = cv2.morphologyEx(marked, cv2.MORPH_CLOSE, kernel) > 0
+    return (closed | (chart.hole & (cv2.dilate(marked, kernel) > 0))) & chart.there
 
 
 def _refined(
     run: _Run,
-    kept: Gaussians,
+    scene: Gaussians,
+    keep: np.ndarray,  # [N] bool
     added: Gaussians | None,
     masks: Masks,
     painted: dict[str, np.ndarray],
     told: dict[str, np.ndarray],
     settings: RemovalSettings,
-) -> Gaussians | None:
-    """The new Gaussians, optimised where the settings ask for it."""
+) -> tuple[np.ndarray, Gaussians | None]:
+    """What stays and the new Gaussians, optimised where the settings ask for it."""
     if added is None or not settings.refine.steps:
-        return added
+        return keep, added
     views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
     refinement: Refinement = run(
         "refine",
-        lambda: refine_gaussians(kept, added, views, settings.refine, settings.random_seed, run.progress),
+        lambda: refine_gaussians(scene.take(keep), added, views, settings.refine, settings.random_seed, run.progress),
     )
-    return refinement.gaussians
+    return keep, refinement.gaussians
 
 
 def _fill_from_one_view(
@@ -323,6 +485,7 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
+    hits: dict[str, Hits],  # where charts are; empty without them
     photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
@@ -338,19 +501,20 @@ def _fill_from_one_view(
     view = next(v for v in open_views if v.camera.id == choice.camera_id)
     completed: DepthCompletion = run(
         f"depth{suffix}",
-        lambda: _complete_depth(view, open_views, painted[view.camera.id], settings, given, first=not suffix),
+        lambda: _complete_depth(view, open_views, hits, painted[view.camera.id], settings, given, first=not suffix),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
-    seeds = seed_gaussians(view.camera, appearance.image, depth, view.target, filled.is_surfels, settings.seed)
-    if len(seeds) == 0:
-        raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
-    with_seeds = filled.extended(seeds)
+    name = view.camera.id
+    run.pictures += [
+        Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
+        *_fit_picture(completed, appearance.image, name),
+    ]
 
-    def to_paint(v: ViewMasks) -> ViewToPaint:
+    def to_paint(v: ViewMasks, with_seeds: Gaussians) -> ViewToPaint:
         name = v.camera.id
         window = near_hole(v.target, settings.propagate)
         depth_new = np.zeros_like(v.depth_before)
@@ -359,35 +523,70 @@ def _fill_from_one_view(
         return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
+    new, painting = _carried(
+        run,
+        suffix,
+        view.camera,
+        appearance,
+        depth,
+        view.target,
+        source,
+        filled,
+        open_views,
+        to_paint,
+        painted,
+        settings,
+    )
+    return new, _with_reference(painting, view, appearance)
+
+
+def _carried(
+    run: _Run,
+    suffix: str,
+    camera: Camera,  # the reference
+    appearance: Appearance,
+    depth: np.ndarray,
+    target: np.ndarray,
+    source: np.ndarray,
+    filled: Gaussians,
+    open_views: Sequence[ViewMasks],
+    to_paint: Callable[[ViewMasks, Gaussians], ViewToPaint],
+    painted: dict[str, np.ndarray],
+    settings: RemovalSettings,
+) -> tuple[Gaussians, Propagation]:
+    """A completed reference in every view, and the Gaussians that show it."""
+    seeds = seed_gaussians(camera, appearance.image, depth, target, filled.is_surfels, settings.seed)
+    if len(seeds) == 0:
+        raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
+    with_seeds = filled.extended(seeds)
     field_: MappingField = run(
         f"mapping{suffix}",
         lambda: mapping_field(
             appearance.image,
-            view.target,
+            target,
             source,
             source_visibility(
-                view.camera,
+                camera,
                 depth,
                 [(v.camera, v.depth_before, v.silhouette) for v in open_views],
                 settings.mapping,
             ),
             settings.mapping,
             settings.random_seed,
-            view.camera,
+            camera,
             depth,
         ),
     )
-    reference = Reference(view.camera, appearance.image, depth, view.target, source, field_.rows, field_.cols)
+    reference = Reference(camera, appearance.image, depth, target, source, field_.rows, field_.cols)
     painting: Propagation = run(
         f"propagate{suffix}",
-        lambda: propagate(reference, [partial(to_paint, v) for v in open_views], settings.propagate, run.progress),
+        lambda: propagate(
+            reference, [partial(to_paint, v, with_seeds) for v in open_views], settings.propagate, run.progress
+        ),
     )
-    painting = _with_reference(painting, view, appearance)
-    name = view.camera.id
+    name = camera.id
     run.pictures += [
-        Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
-        *_fit_picture(completed, appearance.image, name),
-        Picture("appearance", f"The reference without the object, {name}", appearance.image, (view.target,)),
+        Picture("appearance", f"The reference without the object, {name}", appearance.image, (target,)),
         Picture("mapping", f"Mapping field of {name}", appearance.image, (field_.rows, field_.cols)),
         *(
             Picture(
@@ -404,8 +603,8 @@ def _fill_from_one_view(
         f"seed{suffix}",
         lambda: settle_gaussians(
             filled,
-            colour_gaussians(seeds, view.camera, cameras, painting.views, filled.sh_degree, settings.seed),
-            view.camera,
+            colour_gaussians(seeds, camera, cameras, painting.views, filled.sh_degree, settings.seed),
+            camera,
             cameras,
             painting.views,
             settings.seed,
@@ -432,12 +631,23 @@ def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearan
 def _complete_depth(
     view: ViewMasks,
     open_views: Sequence[ViewMasks],
+    hits: dict[str, Hits],
     base: np.ndarray,
     settings: RemovalSettings,
     given: np.ndarray | None,
     first: bool = True,  # reference; a file's prior is of that view
 ) -> DepthCompletion:
-    """The reference's depth; a model that estimates it looks at the picture given, or at a first fill."""
+    """The reference's depth: the charts', unless the user has another prior.
+
+    A model that estimates it looks at the picture given, or at a first fill.
+    """
+    if hits and settings.depth_prior == "auto":
+        there = hits[view.camera.id].depth
+        depth = np.where(view.target & (there > 0), there, view.depth_after).astype(np.float32)
+        share = float((there[view.target] > 0).mean())
+        words = f"{share:.0%} of the hole lies on charts"
+        known = np.ones(depth.shape, np.float32)
+        return DepthCompletion(disparity_of(depth), depth, known, 0.0, np.zeros((0, 2), np.float32), 0, 0, share, words)
     picture, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:
         spec = "auto"
@@ -462,7 +672,7 @@ def preview(
     shown = [Picture("mask", f"Region to fill in {name}", picture, (view.target,))]
     if view.target.any():
         try:
-            completed = _complete_depth(view, views, picture, settings, None)
+            completed = _complete_depth(view, views, {}, picture, settings, None)
         except IllPosed:
             return tuple(shown)  # the region is worth seeing all the more
         depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
@@ -609,6 +819,7 @@ def _finish(
     keep: np.ndarray,
     added: Gaussians | None,
     masks: Masks,
+    charts: Sequence[Chart],
     painted: dict[str, np.ndarray],
     warnings: list[str],
 ) -> RemovalResult:
@@ -619,6 +830,7 @@ def _finish(
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
         painted=painted,
+        charts=tuple(charts),
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
@@ -629,9 +841,14 @@ def _finish(
 # What a stage store has to know to bring results back.
 STORED = (
     Camera,
+    Chart,
+    Charted,
     Gaussians,
+    Hits,
     Masks,
+    Plane,
     Selection,
+    Targets,
     ViewMasks,
     ReferenceChoice,
     ViewScore,

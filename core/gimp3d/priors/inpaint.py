@@ -62,6 +62,7 @@ class Unfinished:
     seed: int = 0  # the same seed gives the same fill
     disparity: np.ndarray | None = None  # [H, W] float32, 1/z of the surface, in the hole too; 0 = infinity or nothing
     K: np.ndarray | None = None  # [3, 3], known with the disparity
+    unknown: np.ndarray | None = None  # [H, W] bool, pixels that mean nothing either, but are not to be filled
 
 
 Provider = Callable[[Unfinished], Appearance]
@@ -74,6 +75,7 @@ def inpaint_reference(
     seed: int = 0,
     disparity: np.ndarray | None = None,  # [H, W] float32, of the completed surface; None: not known
     K: np.ndarray | None = None,  # [3, 3]
+    unknown: np.ndarray | None = None,  # [H, W] bool, see Unfinished
 ) -> Appearance:
     """Fill the hole by the provider that `spec` names (CONTRACT: Providers).
 
@@ -91,7 +93,7 @@ def inpaint_reference(
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
     if hole.all() and not spec.startswith("file:"):
         raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
-    filled = provider(Unfinished(image, hole, seed, disparity, K))
+    filled = provider(Unfinished(image, hole, seed, disparity, K, unknown))
     return Appearance(np.where(hole[..., None], filled.image, image), filled.confidence, filled.reason)
 
 
@@ -126,7 +128,8 @@ def exemplar(view: Unfinished) -> Appearance:
     if view.disparity is not None and view.K is not None:
         corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])
         surface = tangent_planes(view.disparity[near], view.K - corner)
-    done = complete_picture(view.image[near], view.hole[near], ExemplarSettings(seed=view.seed), surface)
+    unknown = None if view.unknown is None else view.unknown[near]
+    done = complete_picture(view.image[near], view.hole[near], ExemplarSettings(seed=view.seed), surface, unknown)
     if np.isnan(done.misfit):
         return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))

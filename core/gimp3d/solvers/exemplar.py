@@ -16,7 +16,7 @@ from ..threads import run_ranges
 from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
-from .patchmatch import NearestNeighbourField, PatchMatchSettings, patch_centres, refined, upsampled
+from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
 from .poisson import solve_hole
 from .surface import Surface, coarser, supports, warps, whole_patches
 
@@ -60,6 +60,7 @@ def complete_picture(
     hole: np.ndarray,  # [H, W] bool, not all of it
     settings: ExemplarSettings = ExemplarSettings(),
     surface: Surface | None = None,  # what the picture shows
+    unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
 ) -> Completion:
     """Fill the hole so that every patch of it resembles one outside.
 
@@ -71,6 +72,11 @@ def complete_picture(
     radius = settings.patch // 2
     if surface is not None:  # what is filled is mixed with nothing
         surface = surface._replace(clear=surface.clear | hole)
+    if unknown is None or not (unknown & ~hole).any() or (unknown | hole).all():
+        unknown = np.zeros(hole.shape, bool)
+    else:  # they must say something where patches reach into them
+        rows, cols = nearest_allowed(~(unknown | hole))
+        image = np.where(unknown[..., None], image[rows, cols], image)
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
@@ -79,7 +85,9 @@ def complete_picture(
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
         there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
-        level = _prepared(channels, open_, there, radius, settings)
+        shape = open_.shape[::-1]
+        barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
+        level = _prepared(channels, open_, barred, there, radius, settings)
         rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
         colours, field = _filled(level, field, rounds, settings)
     assert field is not None
@@ -105,13 +113,21 @@ class _Level:
 
 
 def _prepared(
-    channels: np.ndarray, hole: np.ndarray, surface: Surface | None, radius: int, settings: ExemplarSettings
+    channels: np.ndarray,
+    hole: np.ndarray,
+    unknown: np.ndarray,
+    surface: Surface | None,
+    radius: int,
+    settings: ExemplarSettings,
 ) -> _Level:
     touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-    usable = ~hole if surface is None else ~hole & surface.clear
+    known = ~hole & ~unknown
+    if not patch_centres(known, radius).any():
+        known = ~hole
+    usable = known if surface is None else known & surface.clear
     allowed = patch_centres(usable, radius)
     if not allowed.any():
-        usable, allowed = ~hole, patch_centres(~hole, radius)
+        usable, allowed = known, patch_centres(known, radius)
     if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
         allowed = whole
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)

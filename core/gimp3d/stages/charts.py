@@ -1,0 +1,461 @@
+"""Charts: the surfaces that the object hid, each seen straight on by a camera that nobody stood at.
+
+A chart's picture is made of all photos with the object left out; what no photo shows is its hole.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import scipy.ndimage
+
+from ..box import Region, in_region
+from ..camera import Camera
+from ..solvers.thin_plate import thin_plate
+from ..threads import parallel_map, run_ranges
+from .masks import ViewMasks
+from .mosaic import mosaic
+from .outline import surface_points, window_round
+from .witness import Says, Textures, Witness, ask, meet_range, pack
+
+PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
+MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
+
+
+@dataclass(frozen=True)
+class ChartSettings:
+    """How surfaces are found. Lengths in diagonals of the region's boxes unless said otherwise."""
+
+    tolerance: float = 0.05  # relative z by which a view's surface must be nearer to hide a point
+    ring: int = 24  # px round the object from which surface is gathered
+    hidden: float = 0.15  # share of the views by which the object hides a point of surface that tells of what it hid
+    inlier: float = 0.03  # distance up to which such a point lies on a plane
+    least: float = 0.1  # share of the points that a plane must hold
+    most: int = 3  # a floor and two walls
+    search: float = 0.12  # how far photos may move a plane along its normal
+    precise: float = 6e-4  # to what it is settled
+    rival: float = 1.1  # how much better photos must agree on a plane of its own than on a better one, for its points
+    relief: float = 0.9  # share of what photos disagree on, on the plane, that a relief may leave
+    height: float = 0.25  # of a relief at most; what is higher stands on the surface
+    largest: int = 900  # px, side of a chart at most
+    witnesses: int = 1  # photos that must show a texel
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane with axes; all [3], scene coordinates."""
+
+    origin: np.ndarray  # the region's foot on it
+    right: np.ndarray
+    down: np.ndarray
+    normal: np.ndarray  # unit, towards the cameras
+
+    @classmethod
+    def make(cls, point: np.ndarray, normal: np.ndarray, region: Region) -> Plane:
+        """Through a point; the axes follow the box whose edges lie nearest to the plane."""
+        centre = np.mean([box.center for box in region], axis=0)
+        edges = region[0].axes.T
+        along = edges - np.outer(edges @ normal, normal)
+        right = along[int(np.argmax(np.linalg.norm(along, axis=1)))]
+        right = right / np.linalg.norm(right)
+        return cls(centre - normal * ((centre - point) @ normal), right, np.cross(right, normal) * -1, normal)
+
+    def points(self, x: np.ndarray, y: np.ndarray, height: np.ndarray | float = 0.0) -> np.ndarray:
+        """Scene coordinates [..., 3] of places on the plane, or above it."""
+        h = np.broadcast_to(height, np.shape(x))
+        return self.origin + x[..., None] * self.right + y[..., None] * self.down + h[..., None] * self.normal
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """[N, 3]: x, y and height of points."""
+        return (points - self.origin) @ np.stack([self.right, self.down, self.normal], axis=1)
+
+    def tilted(self, offset: float, slope_x: float, slope_y: float) -> Plane:
+        """Moved along the normal and tilted about the origin."""
+        normal = self.normal - slope_x * self.right - slope_y * self.down
+        normal /= np.linalg.norm(normal)
+        right = self.right - normal * (self.right @ normal)
+        right /= np.linalg.norm(right)
+        return Plane(self.origin + offset * self.normal, right, np.cross(normal, right), normal)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A surface seen straight on; arrays [H, W] of its camera."""
+
+    camera: Camera
+    plane: Plane
+    kind: str  # plane | relief
+    depth: np.ndarray  # float32 z of the completed surface
+    there: np.ndarray  # bool, the surface is there: beyond its edges, what lies behind it shows
+    image: np.ndarray  # [H, W, 3] uint8, from photos; 0 where none shows it
+    photos: np.ndarray  # uint16, how many show it
+    hole: np.ndarray  # bool, the object hides it in some photos, and none shows it
+    agreement: float  # of the photos round the hole, see Textures
+    noise: float  # median distance of the views' drawn surfaces from it, scene units
+    tolerance: float  # relative z within which a view's drawn surface is this one
+    reason: str
+
+
+def heights(chart: Chart, points: np.ndarray) -> np.ndarray:
+    """[N]: how far points [N, 3] lie before the chart's surface, scene units; NaN beside it."""
+    uv, z = chart.camera.project(points)
+    with np.errstate(invalid="ignore"):
+        framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
+    cols, rows = uv[framed].astype(int).T
+    found = np.full(len(points), np.nan)
+    found[framed] = np.where(chart.there[rows, cols], chart.depth[rows, cols] - z[framed], np.nan)
+    return found
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Surface that the views show round the object."""
+
+    points: np.ndarray  # [N, 3]
+    eyes: np.ndarray  # [N, 3] where the view stood that shows it
+    weight: np.ndarray  # [N], how much it tells of what the object hid
+
+    def take(self, rows: np.ndarray) -> _Round:
+        return _Round(self.points[rows], self.eyes[rows], self.weight[rows])
+
+    def on(self, plane: Plane) -> np.ndarray:
+        """[N, 3]: where the same rays meet a plane."""
+        rays = self.points - self.eyes
+        along = rays @ plane.normal
+        reach = ((plane.origin - self.eyes) @ plane.normal) / np.where(np.abs(along) > 1e-12, along, np.nan)
+        return self.eyes + np.where(reach > 0, reach, np.nan)[:, None] * rays
+
+
+def _surface_round(
+    views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region, settings: ChartSettings
+) -> _Round:
+    def of(view: ViewMasks, witness: Witness) -> tuple[np.ndarray, np.ndarray]:
+        far = cv2.distanceTransform((~witness.hidden).astype(np.uint8), cv2.DIST_L2, 5)
+        ring = (far > 2) & (far <= settings.ring) & (view.alpha_before > 0.9) & ~view.occluder
+        window = (slice(0, view.camera.height), slice(0, view.camera.width))
+        step = max(1, round(math.sqrt(ring.sum() * len(views) / 100_000)))
+        points = surface_points(view.camera, np.where(ring, view.depth_before, 0), window, step)[2]
+        return points, np.broadcast_to(view.camera.centre, points.shape)
+
+    parts = parallel_map(lambda p: of(*p), list(zip(views, witnesses)))
+    points, eyes = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+    outside = ~in_region(region, points)
+    points, eyes = points[outside], eyes[outside]
+    said = ask(witnesses, points, settings.tolerance)
+    share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
+    near = share > settings.hidden
+    return _Round(points[near], eyes[near], share[near] ** 2)
+
+
+def find_planes(
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
+    region: Region,
+    settings: ChartSettings = ChartSettings(),
+) -> tuple[Plane, ...]:
+    """The planes nearest to the surfaces that run into what the object hid.
+
+    Planes are sought among the points of surface round the object, each counting by the square of the share of views
+    in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
+    photos' textures agree best, since the depths of rough splats do not tell; and of two planes that could both be
+    what some pixels show, photos choose as well.
+    """
+    diagonal = extent(region)
+    around = _surface_round(views, witnesses, region, settings)
+    textures = Textures.make(witnesses)
+    cameras = np.array([v.camera.centre for v in views])
+    rng, left = np.random.default_rng(0), around
+    found: list[tuple[float, Plane, _Round]] = []
+    while len(found) <= settings.most:
+        candidate = _largest_plane(left.points, left.weight, settings.inlier * diagonal, rng)
+        if candidate is None or left.weight[candidate[2]].sum() < settings.least * around.weight.sum():
+            break
+        point, normal, on = candidate
+        facing = normal if np.median((cameras - point) @ normal) > 0 else -normal
+        plane = _settled(Plane.make(point, facing, region), diagonal, textures, settings)
+        own = left.take(on)
+        found.append((float(textures.agreement(own.on(plane))), plane, own))
+        left = left.take(~on)
+    found.sort(key=lambda f: -f[0] * f[2].weight.sum())
+    planes: list[Plane] = []
+    for told, plane, own in found:
+        if not planes or told >= settings.rival * max(textures.agreement(own.on(p)) for p in planes):
+            planes.append(plane)
+    return tuple(planes)
+
+
+def draw_charts(
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
+    region: Region,
+    settings: ChartSettings = ChartSettings(),
+) -> tuple[Chart, ...]:
+    """What photos show of the surfaces at the planes; those without a hole are left out."""
+    textures = Textures.make(witnesses)
+    charts: list[Chart] = []
+    for plane in planes:
+        chart = _chart(plane, extent(region), views, witnesses, textures, settings)
+        if chart is not None:
+            charts.append(chart)
+    bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
+    return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
+
+
+def _bounded(chart: Chart, charts: Sequence[Chart]) -> Chart:
+    """The chart, ended where it goes through another one that all photos show it before: a floor at a wall."""
+    x, y = chart.camera.pixel_centres().reshape(-1, 2).T
+    points = chart.camera.unproject(np.stack([x, y], -1), chart.depth.ravel().astype(np.float64))
+    there = chart.there
+    shown = there & (chart.photos > 0)
+    for other in charts:
+        if other is chart or abs(other.plane.normal @ chart.plane.normal) > PARALLEL:
+            continue
+        behind = (other.plane.local(points)[:, 2] < 0).reshape(there.shape)
+        if shown.any() and behind[shown].mean() < MEETING:
+            there = there & ~behind
+    return replace(chart, there=there, hole=chart.hole & there)
+
+
+def extent(region: Region) -> float:
+    """The diagonal of the region's box, or of what holds all its boxes."""
+    corners = np.concatenate([b.corners() for b in region])
+    return float(np.linalg.norm(region[0].size if len(region) == 1 else np.ptp(corners, axis=0)))
+
+
+def _largest_plane(
+    points: np.ndarray,  # [N, 3]
+    weight: np.ndarray,  # [N]
+    tolerance: float,
+    rng: np.random.Generator,
+    tries: int = 512,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """A point of the plane that holds most weight, its unit normal, and which points lie on it [N] bool.
+
+    RANSAC (Fischler & Bolles 1981), points drawn by their weight; then least squares.
+    """
+    if len(points) < 3 or weight.sum() <= 0:
+        return None
+    chance = weight / weight.sum()
+    drawn = points[rng.choice(len(points), (tries, 3), p=chance)]
+    normals = np.cross(drawn[:, 1] - drawn[:, 0], drawn[:, 2] - drawn[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    proper = length > 1e-12
+    if not proper.any():
+        return None
+    normals, origins = normals[proper] / length[proper, None], drawn[proper, 0]
+    judges = points[rng.choice(len(points), min(len(points), 4000), p=chance)]
+    votes = (np.abs(judges @ normals.T - (normals * origins).sum(1)) < tolerance).sum(0)
+    normal, point = normals[votes.argmax()], origins[votes.argmax()]
+    for _ in range(5):
+        on = np.abs((points - point) @ normal) < tolerance
+        w = weight[on]
+        if len(w) < 3:
+            return None
+        point = (points[on] * w[:, None]).sum(0) / w.sum()
+        normal = np.linalg.svd((points[on] - point) * np.sqrt(w)[:, None], full_matrices=False)[2][2]
+    return point, normal, np.abs((points - point) @ normal) < tolerance
+
+
+def _grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places on a square, [count, count] each."""
+    side = ((np.arange(count) + 0.5) / count * 2 - 1) * half
+    x, y = np.meshgrid(side, side)
+    return x, y
+
+
+def _settled(plane: Plane, half: float, textures: Textures, settings: ChartSettings) -> Plane:
+    """The plane where photos agree best: a sweep along the normal, then a pattern search with tilts (Hooke 1961)."""
+    x, y = _grid(half, 160)
+
+    def agreement(at: np.ndarray) -> float:
+        height = at[0] + (at[1] * x + at[2] * y) / half
+        return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+
+    offsets = np.linspace(-1, 1, 25) * settings.search * half
+    told = [agreement(np.array([o, 0, 0])) for o in offsets]
+    at, best = np.array([offsets[int(np.argmax(told))], 0, 0]), max(told)
+    step = 0.01 * half
+    while step > settings.precise * half:
+        moves = [at + step * s * np.eye(3)[k] * (1 if k == 0 else 2) for k in range(3) for s in (1, -1)]
+        told = [agreement(m) for m in moves]
+        k = int(np.argmax(told))
+        if told[k] > best:
+            at, best = moves[k], told[k]
+        else:
+            step /= 2
+    return plane.tilted(at[0], at[1] / half, at[2] / half)
+
+
+def _chart(
+    plane: Plane,
+    diagonal: float,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    settings: ChartSettings,
+) -> Chart | None:
+    x, y = _grid(2 * diagonal, 200)
+    said = ask(witnesses, plane.points(x, y).reshape(-1, 3), settings.tolerance).reshape(-1, 200, 200)
+    hole = _unseen(said, settings)
+    labels, _ = scipy.ndimage.label(hole)
+    near = np.hypot(x, y) < diagonal
+    hole &= np.isin(labels, np.unique(labels[near & hole]))
+    if not hole.any():
+        return None
+    cell = 4 * diagonal / 200
+    low, high = (np.array([x[hole], y[hole]]).min(1) - cell, np.array([x[hole], y[hole]]).max(1) + cell)
+    centre, size = (low + high) / 2, high - low
+    size = np.minimum(size + 2 * np.maximum(0.75 * size.max(), 0.15 * diagonal), 4 * diagonal)
+    # a texel is a pixel of the views that show this place best
+    places = plane.points(*centre[:, None])
+    density = []
+    for v in views:
+        _, z = v.camera.project(places)
+        cosine = float(((v.camera.centre - places[0]) @ plane.normal) / np.linalg.norm(v.camera.centre - places[0]))
+        if z[0] > 0 and cosine > 0:
+            density.append(v.camera.fx * v.camera.fy * cosine / z[0] ** 2)
+    if not density:
+        return None
+    texel = 1 / math.sqrt(float(np.percentile(density, 90)))
+    texel = max(texel, float(size.max()) / settings.largest)
+    width, height = (int(n) for n in np.ceil(size / texel))
+    away = 4 * float(np.linalg.norm(size))
+    rotation = np.stack([plane.right, plane.down, -plane.normal])
+    if np.linalg.det(rotation) < 0:
+        rotation[1] *= -1
+    eye = places[0] + away * plane.normal
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, "chart")
+    depth = np.full((height, width), away, np.float32)
+    kind, noise = "plane", np.nan
+    surface = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)).reshape(-1, 3)
+    agreement = textures.agreement(surface)
+    relief, noise, _ = _relief(camera, depth, plane, views, witnesses, settings, diagonal)
+    if relief is not None:
+        x_ = camera.unproject(camera.pixel_centres(), relief.astype(np.float64)).reshape(-1, 3)
+        told_plane, told_relief = agreement, textures.agreement(x_)
+        if 1 - told_relief < settings.relief * (1 - told_plane):
+            kind, depth, surface, agreement = "relief", relief, x_, told_relief
+        words = f"photos agree by {told_plane:.2f} on the plane, {told_relief:.2f} on the relief"
+    else:
+        words = f"photos agree by {agreement:.2f}"
+    tolerance = _tolerance(surface, witnesses, settings)
+    said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
+    hole, there = _unseen(said, settings), _there(said)
+    hole &= there
+    image = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
+    photos = (said == Says.SEEN).sum(0).astype(np.uint16)
+    return Chart(camera, plane, kind, depth, there, image, photos, hole, agreement, noise, tolerance, words)
+
+
+def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:
+    """How far, relative to z, the views' drawn surfaces scatter about this one: three standard deviations."""
+    some = surface[:: max(1, len(surface) // 5000)]
+    off = []
+    for witness in witnesses:
+        uv, z = witness.camera.project(some)
+        with np.errstate(invalid="ignore"):
+            framed = (z > 0) & (uv >= 0).all(1) & (uv < [witness.camera.width, witness.camera.height]).all(1)
+        cols, rows = uv[framed].astype(int).T
+        front = witness.depth[rows, cols]
+        shown = ~witness.hidden[rows, cols] & (front > 0)
+        off.append(front[shown] / z[framed][shown] - 1)
+    all_ = np.abs(np.concatenate(off)) if off else np.zeros(0)
+    spread = 3 * 1.4826 * float(np.median(all_)) if len(all_) else 0.0
+    return float(np.clip(spread, 0.3 * settings.tolerance, 4 * settings.tolerance))
+
+
+def _unseen(said: np.ndarray, settings: ChartSettings) -> np.ndarray:
+    """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
+    seen, hidden, behind, through = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN, Says.BEHIND, Says.THROUGH))
+    return (seen + through < settings.witnesses) & (hidden > behind)
+
+
+def _there(said: np.ndarray) -> np.ndarray:
+    """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so nearest."""
+    seen, through = (said == Says.SEEN).sum(0), (said == Says.THROUGH).sum(0)
+    known = seen + through > 0
+    if not known.any():
+        return np.ones(known.shape, bool)
+    rows, cols = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return (seen >= through)[rows, cols]
+
+
+def _relief(
+    camera: Camera,
+    flat: np.ndarray,  # [H, W] z of the plane
+    plane: Plane,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    settings: ChartSettings,
+    diagonal: float,
+) -> tuple[np.ndarray | None, float, np.ndarray]:
+    """z of the surface as the views' depth maps have it, completed where they have none; median |height|; known."""
+    cells = 2  # px of a chart that share their points
+    h, w = -(-camera.height // cells), -(-camera.width // cells)
+
+    ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
+    corners = camera.unproject(ends, np.full(4, flat.max(), float))
+
+    def of(view: ViewMasks, witness: Witness) -> np.ndarray:
+        z = np.where(witness.hidden | (view.alpha_before < 0.9) | view.occluder, 0, view.depth_before)
+        uv, front = view.camera.project(corners)
+        window = (slice(0, view.camera.height), slice(0, view.camera.width))
+        if (front > 0).all():
+            window = window_round(uv, view.camera, 8)
+        points = surface_points(view.camera, z, window)[2]
+        uv, z = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            ok = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
+            ok &= np.abs(plane.local(points)[:, 2]) < settings.height * diagonal
+        col, row = (uv[ok] / cells).astype(int).T
+        return np.stack([row * w + col, z[ok]], -1)
+
+    found = np.concatenate(parallel_map(lambda p: of(*p), list(zip(views, witnesses))))
+    order = np.lexsort((found[:, 1], found[:, 0]))
+    key, z = found[order, 0].astype(int), found[order, 1]
+    count = np.bincount(key, minlength=h * w)
+    start = np.cumsum(count) - count
+    there = count >= 3
+    value = np.zeros(h * w)
+    value[there] = z[start[there] + count[there] // 2]
+    value, there = value.reshape(h, w), there.reshape(h, w)
+    if there.sum() < 100:
+        return None, np.nan, there
+    noise = float(np.median(np.abs(value[there] - flat.max())))
+    offset = np.where(there, value - flat.max(), 0)
+    done = thin_plate(offset, there.astype(float), np.ones((h, w), bool))
+    done = np.nan_to_num(done)
+    full = cv2.resize(done.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR) + flat
+    return full, noise, there
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What a view's rays meet of charts; arrays [H, W] of the view."""
+
+    chart: np.ndarray  # int8, the chart met first; −1: none
+    depth: np.ndarray  # float32, z there; 0: none
+    rows: np.ndarray  # int32, the chart's texel
+    cols: np.ndarray
+
+
+def first_hits(
+    charts: Sequence[Chart],
+    camera: Camera,
+    pixels: np.ndarray,  # [H, W] bool, the rays that are asked for
+) -> Hits:
+    """Where rays meet the first of the charts: in a room seen from inside, that is the surface."""
+    shape = pixels.shape
+    hits = Hits(np.full(shape, -1, np.int8), np.zeros(shape, np.float32), *np.zeros((2, *shape), np.int32))
+    rows, cols = np.nonzero(pixels)
+    for k, chart in enumerate(charts):
+        where = pack(camera), pack(chart.camera), chart.depth, chart.there
+        run_ranges(meet_range, len(rows), rows, cols, *where, k, hits.chart, hits.depth, hits.rows, hits.cols)
+    return hits

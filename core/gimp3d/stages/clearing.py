@@ -1,0 +1,187 @@
+"""What the removal must not leave in the air, and which pixels the charts' holes are, once it is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..box import Region, in_region
+from ..gaussians import Gaussians
+from ..raster import drawing, footprint, label_weights, touched_window
+from ..threads import parallel_map
+from .charts import Chart, Hits, extent, first_hits, heights
+from .masks import ViewMasks
+from .outline import window_mask
+from .selection import Fate, Selection, SelectionSettings, near_region
+from .witness import Says, Witness, ask
+
+OBJECT, ELSE = 1, 2  # labels of a view's pixels
+NEAR = 0.1  # of the region's extent: what is farther from a chart does not tell how its Gaussians scatter
+SCATTER = 2.0  # standard deviations of the heights of a surface's Gaussians up to which one lies on it
+FEW = 50  # Gaussians
+
+
+@dataclass(frozen=True)
+class ClearingSettings:
+    """When a Gaussian is haze, and what a view's target is."""
+
+    object_weight: float = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
+    rim: int = 1  # px by which the object is larger in the photo than in the splats
+    observed: float = 0.5  # share of a Gaussian's weight that photos must show
+    shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
+    solid: float = 0.5  # alpha below which the scene has no surface
+    margin: int = 1  # px by which a target grows within what the object hides
+
+
+def object_pixels(
+    scene: Gaussians, removed: np.ndarray, views: Sequence[ViewMasks], settings: ClearingSettings
+) -> list[np.ndarray]:
+    """Where each photo shows the object, [H, W] bool."""
+    gone = scene.take(removed)
+    kernel = np.ones((2 * settings.rim + 1,) * 2, np.uint8)
+
+    def of(view: ViewMasks) -> np.ndarray:
+        window = window_mask(touched_window(gone, view.camera), view.camera)
+        shown = footprint(scene, view.camera, removed, pixels=window) > settings.object_weight
+        return cv2.dilate(shown.astype(np.uint8), kernel) > 0
+
+    return parallel_map(of, views)
+
+
+def observed_share(
+    kept: Gaussians, rows: np.ndarray, views: Sequence[ViewMasks], witnesses: Sequence[Witness]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each kept Gaussian in `rows` [N] bool: the share of its weight that photos show, and the weight they do not.
+
+    Weights are blend weights in the emptied scene, summed over the pixels of all views; a photo does not show what
+    lies where the object is. What only the removal reveals has a share near 0: haze (both [N]).
+    """
+
+    def of(pair: tuple[ViewMasks, Witness]) -> np.ndarray:
+        view, witness = pair
+        labels = np.where(witness.hidden, OBJECT, ELSE).astype(np.uint8)
+        return label_weights(kept, view.camera, labels, ELSE, rows)
+
+    total = np.zeros((2, len(kept)))
+    pairs = list(zip(views, witnesses))
+    for start in range(0, len(pairs), 8):  # few results at a time are in memory
+        for part in parallel_map(of, pairs[start : start + 8]):
+            total += part
+    hidden, seen = total
+    return np.where(rows, seen / np.maximum(seen + hidden, 1e-9), 1.0), np.where(rows, hidden, 0.0)
+
+
+def by_charts(
+    scene: Gaussians,
+    region: Region,
+    selection: Selection,
+    charts: Sequence[Chart],
+) -> Selection:
+    """What lies in the region goes unless it lies on a chart, as far as its surface's own Gaussians scatter.
+
+    Where splats are rough, a shoe on the floor runs into the floor as smoothly as the floor itself.
+    """
+    means = scene.means.astype(np.float64)
+    inside = in_region(region, means) & scene.usable
+    solid = scene.usable & (scene.opacity_logits > 0) & ~inside & ~selection.removed
+    on = np.zeros(len(scene), bool)
+    for chart in charts:
+        height = heights(chart, means)
+        ring = height[solid & (np.abs(height) < NEAR * extent(region))]
+        if len(ring) < FEW:
+            continue
+        middle = float(np.median(ring))
+        scatter = middle + SCATTER * 1.4826 * float(np.median(np.abs(ring - middle)))
+        on |= np.isfinite(height) & (height <= scatter)
+    fates = selection.fates.copy()
+    fates[inside & ~on & (fates == Fate.KEPT_SURFACE)] = Fate.REMOVED_INSIDE
+    return Selection(fates)
+
+
+def clear_air(
+    scene: Gaussians,
+    region: Region,
+    selection: Selection,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    tolerance: float,
+    settings: ClearingSettings = ClearingSettings(),
+) -> Selection:
+    """Remove what only the removal reveals, where no photo shows that anything is."""
+    stays = ~selection.removed
+    kept = scene.take(stays)
+    near = near_region(scene, region, SelectionSettings(near=1.0))[stays]
+    share, hidden = observed_share(kept, near, views, witnesses)
+    haze = near & kept.usable & (share < settings.observed) & (hidden > settings.shown)
+    candidates = np.flatnonzero(haze)
+    said = ask(witnesses, kept.means[candidates].astype(np.float64), tolerance)
+    vouched = np.isin(said, (Says.SEEN, Says.THROUGH)).any(0)
+    fates = selection.fates.copy()
+    fates[np.flatnonzero(stays)[candidates[~vouched]]] = Fate.REMOVED_REVEALED
+    return Selection(fates)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Views without the object, and where charts are in them."""
+
+    views: tuple[ViewMasks, ...]
+    hits: tuple[Hits, ...]  # of the same views
+
+
+def chart_targets(
+    scene: Gaussians,
+    selection: Selection,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    charts: Sequence[Chart],
+    tolerance: float,
+    extra: Sequence[np.ndarray | None],  # [H, W] bool each: to be filled too
+    settings: ClearingSettings = ClearingSettings(),
+) -> Targets:
+    """T of every view: rays that meet a chart's hole, or a chart where the emptied scene has no surface.
+
+    What the scene, emptied, shows clearly before a chart is not filled: other photos saw it.
+    """
+    removed = selection.removed
+    gone = scene.take(removed)
+    kernel = np.ones((3, 3), np.uint8)
+
+    def of(k: int) -> tuple[ViewMasks, Hits]:
+        view, hidden = views[k], witnesses[k].hidden
+        window = window_mask(touched_window(gone, view.camera, 24), view.camera) | hidden
+        drawn = drawing(scene, view.camera, with_colour=False, pixels=window)
+        depth, alpha = drawn.surface_depth(gone=removed)
+        touched = drawn.footprint(removed) > 0.05
+        depth_after = np.where(window, depth, view.depth_before)
+        alpha_after = np.where(window, alpha, view.alpha_before)
+        hits = first_hits(charts, view.camera, window)
+        unseen = np.zeros(window.shape, bool)
+        for number, chart in enumerate(charts):
+            there = hits.chart == number
+            unseen[there] = chart.hole[hits.rows[there], hits.cols[there]]
+        met = hits.depth > 0
+        bare = met & (alpha_after < settings.solid)
+        before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)
+        target = (unseen & hidden & ~before) | (bare & (hidden | touched) & (view.alpha_before >= settings.solid))
+        target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+        target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
+        target &= met & ~before & (hidden | touched) & ~view.occluder
+        silhouette, before_ = hidden, view.depth_before
+        mark = extra[k]
+        if mark is not None:
+            silhouette, target, before_ = hidden | mark, target | mark, np.where(mark, 0, view.depth_before)
+        return replace(
+            view,
+            silhouette=silhouette,
+            target=target,
+            depth_before=before_,
+            depth_after=depth_after,
+            alpha_after=alpha_after,
+        ), hits
+
+    found = parallel_map(of, range(len(views)))
+    return Targets(tuple(v for v, _ in found), tuple(h for _, h in found))

@@ -1,0 +1,94 @@
+"""One picture of a surface from all photos that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from ..jit import exact_kernel
+from ..threads import parallel_map, run_ranges
+from .witness import Says, Witness
+
+SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say
+FEW = 12.0  # grey levels by which a photo may always differ from what most say
+
+
+def mosaic(
+    camera: Camera,
+    points: np.ndarray,  # [H, W, 3] scene coordinates of what its pixels show
+    normal: np.ndarray,  # [3] unit
+    witnesses: Sequence[Witness],
+    said: np.ndarray,  # [V, H, W], see ask
+) -> np.ndarray:
+    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
+
+    Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
+    decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time: the one
+    with most pixels there of those that agree with the median. Between photos only detail changes, so that no seam
+    shows (two bands of Burt & Adelson 1983). 0 where no photo shows the surface.
+    """
+    h, w = points.shape[:2]
+    flat = points.reshape(-1, 3)
+
+    def of(k: int) -> tuple[np.ndarray, np.ndarray]:
+        c = witnesses[k].camera
+        uv, z = c.project(points)
+        x, y = (np.nan_to_num(uv, nan=-1e4).astype(np.float32) - 0.5).transpose(2, 0, 1)
+        sample = cv2.remap(witnesses[k].photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        towards = c.centre - flat
+        cosine = towards @ normal / np.linalg.norm(towards, axis=1)
+        density = np.where(said[k].ravel() == Says.SEEN, np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
+        return sample.reshape(-1, 3), (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
+
+    parts = parallel_map(of, range(len(witnesses)))
+    samples, density = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
+    common, best = np.zeros((2, h * w, 3), np.float32)
+    run_ranges(_choose_range, h * w, samples, density, FEW, common, best)
+    common, best = common.reshape(h, w, 3), best.reshape(h, w, 3)
+    shown = (density > 0).any(0).reshape(h, w)
+    detail = best - _smooth(best, shown)
+    return np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0).astype(np.uint8)
+
+
+def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    weight = shown.astype(np.float32)
+    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), SEAM)
+    return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), SEAM), 1e-3)[..., None]
+
+
+@exact_kernel
+def _choose_range(lo, hi, samples, density, few, common, best):
+    views = len(samples)
+    values = np.empty(views)
+    for i in range(lo, hi):
+        count = 0
+        for channel in range(3):
+            count = 0
+            for k in range(views):
+                if density[k, i] > 0:
+                    values[count] = samples[k, i, channel]
+                    count += 1
+            if count:
+                part = np.sort(values[:count])
+                common[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
+        if count == 0:
+            continue
+        off, least, largest = 0.0, 1e9, 0.0
+        for k in range(views):  # the nearest to the median always agrees
+            if density[k, i] > 0:
+                off = 0.0
+                for channel in range(3):
+                    off = max(off, abs(samples[k, i, channel] - common[i, channel]))
+                least = min(least, off)
+        for k in range(views):
+            if density[k, i] > largest:
+                off = 0.0
+                for channel in range(3):
+                    off = max(off, abs(samples[k, i, channel] - common[i, channel]))
+                if off <= max(few, least):
+                    largest = density[k, i]
+                    for channel in range(3):
+                        best[i, channel] = samples[k, i, channel]
