@@ -6,8 +6,8 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references extension screenshots \
-	by-mouse clean
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real extension \
+	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -61,6 +61,10 @@ bench-propagate: $(READY)
 # 128 removals: an hour, so not part of bench
 bench-references: $(READY)
 	$(BIN)/python scripts/bench_references.py $(DATA)
+
+# every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
+bench-real: $(READY)
+	$(BIN)/python scripts/bench_real.py $(DATA)
 
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)

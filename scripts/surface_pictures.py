@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from pages import fitted, sheet, titled
 from surface_scenes import Scene, completed, depth_errors, surface, targets
 
 from gimp3d.camera import Camera
@@ -65,26 +66,3 @@ def surface_tiles(scene: Scene, view: ViewMasks, views: Sequence[ViewMasks]) -> 
     size = (picture.shape[1], picture.shape[0])
     names = [output_name(camera.id), words, "truth", f"relative error, 0 to {WORST:.0%}"]
     return [titled(fitted(tile, size), name) for tile, name in zip(tiles, names)]
-
-
-def fitted(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The picture as large as it gets on a black ground of `size` (width, height)."""
-    scale = min(size[0] / picture.shape[1], size[1] / picture.shape[0])
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)[: size[1], : size[0]]
-    ground = np.zeros((size[1], size[0], 3), np.uint8)
-    ground[: small.shape[0], : small.shape[1]] = small
-    return ground
-
-
-def titled(picture: np.ndarray, words: str) -> np.ndarray:
-    bar = np.full((18, picture.shape[1], 3), 30, np.uint8)
-    cv2.putText(bar, words, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (230, 230, 230), 1, cv2.LINE_AA)
-    return np.vstack([bar, picture])
-
-
-def sheet(pictures: list[np.ndarray], columns: int) -> np.ndarray:
-    """Pictures in rows; all are as large as the first."""
-    shape = pictures[0].shape
-    alike = [p if p.shape == shape else fitted(p, (shape[1], shape[0])) for p in pictures]
-    alike += [np.zeros(shape, np.uint8)] * (-len(alike) % columns)
-    return np.vstack([np.hstack(alike[k : k + columns]) for k in range(0, len(alike), columns)])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
 import numpy as np
+from pages import Section, figure, html_table
 from raster_report import table
 from surface_chart import KINDS
 from surface_pictures import COVERED, MISSED, MORE
@@ -17,16 +17,6 @@ from gimp3d.commands import output_name
 from gimp3d.report import STYLE
 
 LEGEND = {"never seen and in T": COVERED, "never seen and missed": MISSED, "in T though some view sees it": MORE}
-
-
-@dataclass(frozen=True)
-class Section:
-    """A table with a heading and what must be known to read it."""
-
-    title: str
-    words: str
-    head: list[str]
-    rows: list[list[str]]
 
 
 def sections(results: dict[str, Any]) -> Iterator[Section]:
@@ -168,17 +158,10 @@ def about(results: dict[str, Any]) -> str:
 
 def page(results: dict[str, Any], charts: dict[str, str]) -> str:
     """Tables, charts (name → SVG) and the sheets of pictures that lie beside the page."""
-    tables = "".join(
-        f"<h2>{escape(s.title)}</h2><p>{escape(s.words)}</p><table>{html_rows(s.head, 'th')}"
-        f"{''.join(html_rows(row, 'td') for row in s.rows)}</table>"
-        for s in sections(results)
-    )
+    tables = "".join(html_table(s) for s in sections(results))
     drawn = "".join(f"<figure class=chart>{svg}</figure>" for svg in charts.values())
     dots = "".join(f"<span class=dot style='background:rgb{c}'></span>{escape(w)}" for w, c in LEGEND.items())
-    sheets = "".join(
-        f"<figure><a href='{name}'><img src='{name}' alt=''></a><figcaption>{escape(name)}</figcaption></figure>"
-        for name in results["pictures"]
-    )
+    sheets = "".join(figure(name) for name in results["pictures"])
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
         f"<title>Where a removal fills</title><style>{STYLE}\nfigure.chart svg{{width:100%;height:auto}}"
@@ -186,7 +169,3 @@ def page(results: dict[str, Any], charts: dict[str, str]) -> str:
         f"<h1>Where a removal fills, and on what surface</h1><p>{escape(about(results))}</p>{drawn}{tables}"
         f"<h2>Pictures</h2><p>{dots}; outline: what the object hides.</p>{sheets}</html>\n"
     )
-
-
-def html_rows(cells: list[str], tag: str) -> str:
-    return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"

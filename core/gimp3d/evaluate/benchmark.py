@@ -63,11 +63,12 @@ def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
     added = 0
     if method == "telea":
         for camera in cameras[1:]:
-            _telea(scene, camera.id, out / "render")
+            name = output_name(camera.id)
+            mask = read_mask(scene / "truth" / f"{name}{MASKS['mask']}")
+            write_png(out / "render" / f"{name}.png", telea(photo_with_object(scene, camera.id), mask))
     else:
         if method == "hole open":
-            file = read_ply(scene / "scene.ply")
-            write_ply(out / "out.ply", file, ~select_removed(file.gaussians, read_region(scene / "roi.json")))
+            empty_region(scene, out / "out.ply")
         else:
             job = RemovalJob(
                 scene=str(scene / "scene.ply"),
@@ -83,26 +84,40 @@ def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
     if method != "telea":
         render_views(out / "out.ply", scene / "transforms.json", out / "render", split="test")
     row: dict[str, Any] = {"scene": scene.name, "method": method, "seconds": seconds, "added": added}
-    folder = Path(output_name(reference.id)).parent
+    return row | score_renders(scene, out / "render", reference.id)
+
+
+def score_renders(scene: Path, renders: Path, reference: str) -> dict[str, float]:
+    """Means over the drawn test views but the reference: "psnr mask", "ssim unseen" and so on."""
+    folder = Path(output_name(reference)).parent
+    row: dict[str, float] = {}
     for key, suffix in MASKS.items():
         scores = evaluate_folders(
-            out / "render" / folder,
-            scene / folder,
-            scene / "truth" / folder,
-            suffix,
-            (Path(reference.id).name,),
+            renders / folder, scene / folder, scene / "truth" / folder, suffix, (Path(reference).name,)
         )
         row |= {f"{metric} {key}": value for metric, value in scores["mean"].items()}
     return row
 
 
-def _telea(scene: Path, camera_id: str, out: Path) -> None:
-    """OpenCV's Telea on the test photo with the object, the true mask dilated."""
+def empty_region(scene: Path, out: Path) -> None:
+    """Write the scene without the Gaussians whose centre lies in the region; nothing is filled."""
+    file = read_ply(scene / "scene.ply")
+    write_ply(out, file, ~select_removed(file.gaussians, read_region(scene / "roi.json")))
+
+
+def photo_with_object(scene: Path, camera_id: str) -> np.ndarray:
+    """A test view's photo with the object [H, W, 3] uint8: for baselines, never input to a removal."""
     stem = Path(camera_id).stem
-    photo = read_image(scene / "images" / f"with_test_{stem}.png")
-    mask = read_mask(scene / "truth" / "test" / f"{stem}.mask.png").astype(np.uint8)
-    grown = cv2.dilate(mask, np.ones((2 * DILATION + 1,) * 2, np.uint8))
-    write_png(out / f"{output_name(camera_id)}.png", cv2.inpaint(photo, grown, 3, cv2.INPAINT_TELEA))
+    return read_image(next((scene / "images").glob(f"with_test_{stem}.*"), scene / "images" / f"with_test_{stem}.png"))
+
+
+def telea(
+    photo: np.ndarray,  # [H, W, 3] uint8
+    mask: np.ndarray,  # [H, W] bool
+) -> np.ndarray:
+    """OpenCV's Telea on the photo, the mask dilated; [H, W, 3] uint8."""
+    grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * DILATION + 1,) * 2, np.uint8))
+    return cv2.inpaint(photo, grown, 3, cv2.INPAINT_TELEA)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
