@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
+import scipy.ndimage
 
 from . import buffers
 from .box import Region
@@ -22,7 +23,7 @@ from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import Chart, ChartSettings, Hits, Plane, draw_charts, find_planes
-from .stages.clearing import ClearingSettings, Targets, by_charts, chart_targets, clear_air, object_pixels
+from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
@@ -61,6 +62,7 @@ from .stages.witness import Witness
 from .threads import parallel_map
 
 R = TypeVar("R")
+DOUBTFUL = 8  # texels round a chart's hole that are filled anew if photos show them beside the object only
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
@@ -352,23 +354,17 @@ def _chart(
     views = masks.views
     marked = [extra.get(v.camera.id) for v in views]
 
-    def witnessed(selection: Selection) -> list[Witness]:
-        objects = object_pixels(scene, selection.removed, views, settings.clearing)
-        hidden = [o if m is None else o | m for o, m in zip(objects, marked)]
-        return [Witness(v.camera, photos[v.camera.id], h, v.depth_before) for v, h in zip(views, hidden)]
-
-    selection, witnesses = masks.selection, witnessed(masks.selection)
+    objects = object_pixels(scene, masks.removed, views, settings.clearing)
+    witnesses = [
+        Witness(v.camera, photos[v.camera.id], o if m is None else o | m, s, v.depth_before)
+        for v, (o, s), m in zip(views, objects, marked)
+    ]
     planes = find_planes(views, witnesses, region, settings.charts)
     charts = draw_charts(planes, views, witnesses, region, settings.charts)
-    if charts:
-        chosen = by_charts(scene, region, selection, charts)
-        if chosen.removed.sum() > selection.removed.sum():
-            selection, witnesses = chosen, witnessed(chosen)
-            charts = draw_charts(planes, views, witnesses, region, settings.charts)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
     tolerance = max(c.tolerance for c in charts)
-    selection = clear_air(scene, region, selection, views, witnesses, tolerance, settings.clearing)
+    selection = clear_air(scene, region, masks.selection, views, witnesses, tolerance, settings.clearing)
     targets = chart_targets(scene, selection, views, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     cleared = int(selection.removed.sum() - masks.removed.sum())
@@ -391,8 +387,8 @@ def _fill_from_chart(
     target = _needed_texels(chart, number, open_views, hits)
     if not target.any():
         return None
-    shown = (chart.photos > 0) & chart.there
-    hole = target & ~shown
+    hole = target & (chart.hole | (chart.photos == 0))
+    hole |= chart.beside & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * DOUBTFUL + 1,) * 2, np.uint8)) > 0)
     appearance: Appearance = run(
         f"appearance{suffix}",
         lambda: inpaint_reference(
@@ -402,10 +398,10 @@ def _fill_from_chart(
             settings.random_seed,
             None if chart.kind == "plane" else disparity_of(chart.depth),
             chart.camera.K,
-            ~shown & ~hole,
+            ~chart.known & ~hole,
         ),
     )
-    source = ~target & shown
+    source = ~target & ~hole & chart.known
 
     def to_paint(v: ViewMasks, _: Gaussians) -> ViewToPaint:
         name, there = v.camera.id, hits[v.camera.id].depth
@@ -456,7 +452,8 @@ def _needed_texels(chart: Chart, number: int, views: Sequence[ViewMasks], hits: 
     # a view that looks on from the side or from afar has fewer pixels than the chart has texels
     kernel = np.ones((5, 5), np.uint8)
     closed = cv2.morphologyEx(marked, cv2.MORPH_CLOSE, kernel) > 0
-    return (closed | (chart.hole & (cv2.dilate(marked, kernel) > 0))) & chart.there
+    needed = (closed | (chart.hole & (cv2.dilate(marked, kernel) > 0))) & chart.there
+    return needed | (scipy.ndimage.binary_fill_holes(needed) & chart.hole)
 
 
 def _refined(

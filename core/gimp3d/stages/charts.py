@@ -23,6 +23,9 @@ from .outline import surface_points, window_round
 from .witness import Says, Textures, Witness, ask, meet_range, pack
 
 PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
+UNLIKE = 3.0  # times what photos usually differ by, from which they show different things
+LEAST_SPREAD = 6.0  # grey levels that photos may always differ by
+LEFTOVER = 6  # px round a hole within which what photos do not agree on is taken for a rest of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 
 
@@ -93,22 +96,13 @@ class Chart:
     there: np.ndarray  # bool, the surface is there: beyond its edges, what lies behind it shows
     image: np.ndarray  # [H, W, 3] uint8, from photos; 0 where none shows it
     photos: np.ndarray  # uint16, how many show it
-    hole: np.ndarray  # bool, the object hides it in some photos, and none shows it
+    known: np.ndarray  # bool, photos show it, and much the same
+    beside: np.ndarray  # bool, photos show it right beside the object only
+    hole: np.ndarray  # bool, the object hides it in some photos, and none shows it, or they show its rests
     agreement: float  # of the photos round the hole, see Textures
     noise: float  # median distance of the views' drawn surfaces from it, scene units
     tolerance: float  # relative z within which a view's drawn surface is this one
     reason: str
-
-
-def heights(chart: Chart, points: np.ndarray) -> np.ndarray:
-    """[N]: how far points [N, 3] lie before the chart's surface, scene units; NaN beside it."""
-    uv, z = chart.camera.project(points)
-    with np.errstate(invalid="ignore"):
-        framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
-    cols, rows = uv[framed].astype(int).T
-    found = np.full(len(points), np.nan)
-    found[framed] = np.where(chart.there[rows, cols], chart.depth[rows, cols] - z[framed], np.nan)
-    return found
 
 
 @dataclass(frozen=True)
@@ -349,9 +343,36 @@ def _chart(
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
     hole &= there
-    image = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
+    image, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
     photos = (said == Says.SEEN).sum(0).astype(np.uint16)
-    return Chart(camera, plane, kind, depth, there, image, photos, hole, agreement, noise, tolerance, words)
+    beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
+    alike = _alike(spread, photos, there & ~hole)
+    grown = cv2.dilate(hole.astype(np.uint8), np.ones((2 * LEFTOVER + 1,) * 2, np.uint8)) > 0
+    hole |= grown & there & (photos > 1) & ~alike
+    return Chart(
+        camera,
+        plane,
+        kind,
+        depth,
+        there,
+        image,
+        photos,
+        alike & ~hole,
+        beside & ~hole,
+        hole,
+        agreement,
+        noise,
+        tolerance,
+        words,
+    )
+
+
+def _alike(spread: np.ndarray, photos: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[H, W] bool: texels of which photos tell much the same: things that stand on the surface smear over it."""
+    told = known & (photos > 1)
+    if not told.any():
+        return photos > 0
+    return told & (spread <= max(LEAST_SPREAD, UNLIKE * float(np.median(spread[told]))))
 
 
 def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:
@@ -379,7 +400,8 @@ def _unseen(said: np.ndarray, settings: ChartSettings) -> np.ndarray:
 
 def _there(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so nearest."""
-    seen, through = (said == Says.SEEN).sum(0), (said == Says.THROUGH).sum(0)
+    seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
+    through = (said == Says.THROUGH).sum(0)
     known = seen + through > 0
     if not known.any():
         return np.ones(known.shape, bool)

@@ -8,20 +8,17 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ..box import Region, in_region
+from ..box import Region
 from ..gaussians import Gaussians
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..threads import parallel_map
-from .charts import Chart, Hits, extent, first_hits, heights
+from .charts import Chart, Hits, first_hits
 from .masks import ViewMasks
 from .outline import window_mask
 from .selection import Fate, Selection, SelectionSettings, near_region
 from .witness import Says, Witness, ask
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
-NEAR = 0.1  # of the region's extent: what is farther from a chart does not tell how its Gaussians scatter
-SCATTER = 2.0  # standard deviations of the heights of a surface's Gaussians up to which one lies on it
-FEW = 50  # Gaussians
 
 
 @dataclass(frozen=True)
@@ -29,6 +26,7 @@ class ClearingSettings:
     """When a Gaussian is haze, and what a view's target is."""
 
     object_weight: float = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
+    some_weight: float = 0.02  # and from which it may show some of it
     rim: int = 1  # px by which the object is larger in the photo than in the splats
     observed: float = 0.5  # share of a Gaussian's weight that photos must show
     shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
@@ -38,15 +36,20 @@ class ClearingSettings:
 
 def object_pixels(
     scene: Gaussians, removed: np.ndarray, views: Sequence[ViewMasks], settings: ClearingSettings
-) -> list[np.ndarray]:
-    """Where each photo shows the object, [H, W] bool."""
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where each photo shows the object, and where it may show some of it, [H, W] bool each."""
     gone = scene.take(removed)
     kernel = np.ones((2 * settings.rim + 1,) * 2, np.uint8)
 
-    def of(view: ViewMasks) -> np.ndarray:
+    def of(view: ViewMasks) -> tuple[np.ndarray, np.ndarray]:
         window = window_mask(touched_window(gone, view.camera), view.camera)
-        shown = footprint(scene, view.camera, removed, pixels=window) > settings.object_weight
-        return cv2.dilate(shown.astype(np.uint8), kernel) > 0
+        weight = footprint(scene, view.camera, removed, pixels=window)
+        shown, some = (
+            # specks are splats of the floor that went along
+            cv2.morphologyEx((weight > least).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+            for least in (settings.object_weight, settings.some_weight)
+        )
+        return cv2.dilate(shown, kernel) > 0, cv2.dilate(some, kernel) > 0
 
     return parallel_map(of, views)
 
@@ -74,33 +77,6 @@ def observed_share(
     return np.where(rows, seen / np.maximum(seen + hidden, 1e-9), 1.0), np.where(rows, hidden, 0.0)
 
 
-def by_charts(
-    scene: Gaussians,
-    region: Region,
-    selection: Selection,
-    charts: Sequence[Chart],
-) -> Selection:
-    """What lies in the region goes unless it lies on a chart, as far as its surface's own Gaussians scatter.
-
-    Where splats are rough, a shoe on the floor runs into the floor as smoothly as the floor itself.
-    """
-    means = scene.means.astype(np.float64)
-    inside = in_region(region, means) & scene.usable
-    solid = scene.usable & (scene.opacity_logits > 0) & ~inside & ~selection.removed
-    on = np.zeros(len(scene), bool)
-    for chart in charts:
-        height = heights(chart, means)
-        ring = height[solid & (np.abs(height) < NEAR * extent(region))]
-        if len(ring) < FEW:
-            continue
-        middle = float(np.median(ring))
-        scatter = middle + SCATTER * 1.4826 * float(np.median(np.abs(ring - middle)))
-        on |= np.isfinite(height) & (height <= scatter)
-    fates = selection.fates.copy()
-    fates[inside & ~on & (fates == Fate.KEPT_SURFACE)] = Fate.REMOVED_INSIDE
-    return Selection(fates)
-
-
 def clear_air(
     scene: Gaussians,
     region: Region,
@@ -118,7 +94,7 @@ def clear_air(
     haze = near & kept.usable & (share < settings.observed) & (hidden > settings.shown)
     candidates = np.flatnonzero(haze)
     said = ask(witnesses, kept.means[candidates].astype(np.float64), tolerance)
-    vouched = np.isin(said, (Says.SEEN, Says.THROUGH)).any(0)
+    vouched = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).any(0)
     fates = selection.fates.copy()
     fates[np.flatnonzero(stays)[candidates[~vouched]]] = Fate.REMOVED_REVEALED
     return Selection(fates)

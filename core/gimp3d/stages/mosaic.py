@@ -22,8 +22,10 @@ def mosaic(
     normal: np.ndarray,  # [3] unit
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
+
+    And by how much photos differ from them, [H, W] float32 grey levels, the median over photos.
 
     Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
     decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time: the one
@@ -31,6 +33,8 @@ def mosaic(
     shows (two bands of Burt & Adelson 1983). 0 where no photo shows the surface.
     """
     h, w = points.shape[:2]
+    clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do
+    told = np.where(clear, said == Says.SEEN, said == Says.BESIDE)
     flat = points.reshape(-1, 3)
 
     def of(k: int) -> tuple[np.ndarray, np.ndarray]:
@@ -40,17 +44,19 @@ def mosaic(
         sample = cv2.remap(witnesses[k].photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         towards = c.centre - flat
         cosine = towards @ normal / np.linalg.norm(towards, axis=1)
-        density = np.where(said[k].ravel() == Says.SEEN, np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
+        density = np.where(told[k].ravel(), np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
         return sample.reshape(-1, 3), (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
 
     parts = parallel_map(of, range(len(witnesses)))
     samples, density = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
     common, best = np.zeros((2, h * w, 3), np.float32)
-    run_ranges(_choose_range, h * w, samples, density, FEW, common, best)
+    spread = np.zeros(h * w, np.float32)
+    run_ranges(_choose_range, h * w, samples, density, FEW, common, best, spread)
     common, best = common.reshape(h, w, 3), best.reshape(h, w, 3)
     shown = (density > 0).any(0).reshape(h, w)
     detail = best - _smooth(best, shown)
-    return np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0).astype(np.uint8)
+    picture = np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0)
+    return picture.astype(np.uint8), spread.reshape(h, w)
 
 
 def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -60,7 +66,7 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 @exact_kernel
-def _choose_range(lo, hi, samples, density, few, common, best):
+def _choose_range(lo, hi, samples, density, few, common, best, spread):
     views = len(samples)
     values = np.empty(views)
     for i in range(lo, hi):
@@ -74,6 +80,8 @@ def _choose_range(lo, hi, samples, density, few, common, best):
             if count:
                 part = np.sort(values[:count])
                 common[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
+                part = np.sort(np.abs(part - common[i, channel]))
+                spread[i] += part[count // 2] / 3
         if count == 0:
             continue
         off, least, largest = 0.0, 1e9, 0.0

@@ -26,9 +26,10 @@ class Says(IntEnum):
     HIDDEN = 2  # the object is in the way
     BEHIND = 3  # something else is
     THROUGH = 4  # what is shown lies behind it: nothing is there
+    BESIDE = 5  # it lies on the surface shown, but right beside the object: the pixel may show both
 
 
-NOTHING, SEEN, HIDDEN, BEHIND, THROUGH = 0, 1, 2, 3, 4  # the same, for the kernels
+NOTHING, SEEN, HIDDEN, BEHIND, THROUGH, BESIDE = 0, 1, 2, 3, 4, 5  # the same, for the kernels
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Witness:
     camera: Camera
     photo: np.ndarray  # [H, W, 3] uint8
     hidden: np.ndarray  # [H, W] bool, where the photo shows the object
+    beside: np.ndarray  # [H, W] bool, where it may show some of it
     depth: np.ndarray  # [H, W] float32 z of the scene with the object, 0 = nothing
 
 
@@ -58,14 +60,14 @@ def ask(
     def of(witness: Witness) -> np.ndarray:
         said = np.zeros(len(points), np.uint8)
         depth = np.ascontiguousarray(witness.depth, np.float32)
-        _ask_range(0, len(points), points, pack(witness.camera), witness.hidden, depth, tolerance, said)
+        _ask_range(0, len(points), points, pack(witness.camera), witness.hidden, witness.beside, depth, tolerance, said)
         return said
 
     return np.array(parallel_map(of, witnesses), np.uint8).reshape(len(witnesses), len(points))
 
 
 @exact_kernel
-def _ask_range(lo, hi, points, c, hidden, depth, tolerance, said):
+def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
     for i in range(lo, hi):
         x, y, w = points[i, 0], points[i, 1], points[i, 2]
         z = c[6] * x + c[7] * y + c[8] * w + c[11]
@@ -84,7 +86,7 @@ def _ask_range(lo, hi, points, c, hidden, depth, tolerance, said):
         elif front > (1 + tolerance) * z or front == 0:
             said[i] = THROUGH
         else:
-            said[i] = SEEN
+            said[i] = BESIDE if beside[row, col] else SEEN
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,8 @@ class Textures:
 
         def of(witness: Witness) -> np.ndarray:
             grey = cv2.cvtColor(witness.photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
-            shown = (~witness.hidden).astype(np.float32)  # the object's edge is no texture of what is beside it
+            hidden = witness.hidden | witness.beside
+            shown = (~hidden).astype(np.float32)  # the object's edge is no texture of what is beside it
             coarse = cv2.GaussianBlur(grey * shown, (0, 0), COARSE) / np.maximum(
                 cv2.GaussianBlur(shown, (0, 0), COARSE), 1e-3
             )
@@ -111,7 +114,7 @@ class Textures:
                 cv2.GaussianBlur(shown, (0, 0), FINE), 1e-3
             )
             band = np.clip(np.rint(2 * (fine - coarse)), -LOUD, LOUD).astype(np.int8)
-            return np.where(witness.hidden, np.int8(-128), band).ravel()
+            return np.where(hidden, np.int8(-128), band).ravel()
 
         values = parallel_map(of, used)
         sizes = np.array([len(v) for v in values], np.int64)
