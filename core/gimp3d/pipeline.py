@@ -28,7 +28,7 @@ from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
-from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
+from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
 from .stages.outline import window_mask
 from .stages.propagate import (
     PaintedView,
@@ -63,6 +63,7 @@ from .threads import parallel_map
 
 R = TypeVar("R")
 DOUBTFUL = 8  # texels round a chart's hole that are filled anew if photos show them beside the object only
+SAME = 0.01  # relative z within which two references show the same surface
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
@@ -273,7 +274,8 @@ def remove_object(
     filled, added = kept, None
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
     as_photo = [None] * (0 if charts else 1 + settings.extra_references)
-    sources: list[Chart | None] = [None] if charts and reference else []
+    sources: list[Chart | None] = [None] * (1 + settings.extra_references) if charts and reference else []
+    done: list[Reference] = []
     for round_, chart in enumerate([*sources, *charts, *as_photo]):
         buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
@@ -282,12 +284,14 @@ def remove_object(
         suffix = "" if first else f" {round_ + 1}"
         try:
             if chart is not None:
-                step = _fill_from_chart(run, suffix, chart, filled, open_views, hits, levelled, painted, settings)
+                step = _fill_from_chart(
+                    run, suffix, _carried_over(chart, done), filled, open_views, hits, levelled, painted, settings
+                )
                 if step is None:
                     continue
-                new, painting = step
+                completed, new, painting = step
             else:
-                new, painting = _fill_from_one_view(
+                completed, new, painting = _fill_from_one_view(
                     run,
                     suffix,
                     filled,
@@ -305,6 +309,7 @@ def remove_object(
                 raise
             run.warnings.append(f"no {'' if first else 'further '}reference view helps: {error}")
             break
+        done.append(completed)
         added = new if added is None else added.extended(new)
         filled = kept.extended(added)
         painted.update({p.camera_id: p.pasted(painted[p.camera_id]) for p in painting.views})
@@ -381,7 +386,7 @@ def _fill_from_chart(
     photos: dict[str, np.ndarray],
     painted: dict[str, np.ndarray],
     settings: RemovalSettings,
-) -> tuple[Gaussians, Propagation] | None:
+) -> tuple[Reference, Gaussians, Propagation] | None:
     """Complete one chart, carry it into every view, and make its Gaussians; None if no view needs it."""
     number = int(chart.camera.id.rpartition(":")[2]) - 1
     target = _needed_texels(chart, number, open_views, hits)
@@ -430,6 +435,26 @@ def _fill_from_chart(
         painted,
         settings,
     )
+
+
+def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
+    """The chart with what completed references show of its hole: a picture that was given rules where it sees it."""
+    points = chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(np.float64))
+    for reference in done:
+        open_points = np.argwhere(chart.hole)
+        if not len(open_points):
+            break
+        rows, cols = open_points.T
+        uv, _ = reference.camera.project(points[rows, cols])
+        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], SAME)
+        x, y = np.where(seen[:, None], uv, 0).astype(np.float32).T[:, :, None] - np.float32(0.5)
+        colours = cv2.remap(reference.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
+        photos = chart.photos.copy()
+        shown = rows[seen], cols[seen]
+        image[shown], known[shown], hole[shown], photos[shown] = colours[seen], True, False, 1
+        chart = replace(chart, image=image, known=known, hole=hole, photos=photos)
+    return chart
 
 
 def snapped(
@@ -488,7 +513,7 @@ def _fill_from_one_view(
     settings: RemovalSettings,
     wanted: str | None,
     given: np.ndarray | None,
-) -> tuple[Gaussians, Propagation]:
+) -> tuple[Reference, Gaussians, Propagation]:
     """Complete one reference, carry it into every view, and make its Gaussians."""
     solid, tried = settings.masks.solid, {c.camera_id for c in run.references}
     choice: ReferenceChoice = run(
@@ -520,7 +545,7 @@ def _fill_from_one_view(
         return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
-    new, painting = _carried(
+    completed_reference, new, painting = _carried(
         run,
         suffix,
         view.camera,
@@ -534,7 +559,7 @@ def _fill_from_one_view(
         painted,
         settings,
     )
-    return new, _with_reference(painting, view, appearance)
+    return completed_reference, new, _with_reference(painting, view, appearance)
 
 
 def _carried(
@@ -550,7 +575,7 @@ def _carried(
     to_paint: Callable[[ViewMasks, Gaussians], ViewToPaint],
     painted: dict[str, np.ndarray],
     settings: RemovalSettings,
-) -> tuple[Gaussians, Propagation]:
+) -> tuple[Reference, Gaussians, Propagation]:
     """A completed reference in every view, and the Gaussians that show it."""
     seeds = seed_gaussians(camera, appearance.image, depth, target, filled.is_surfels, settings.seed)
     if len(seeds) == 0:
@@ -608,7 +633,7 @@ def _carried(
         ),
         lambda g: (1.0, f"{len(g)} new Gaussians"),
     )
-    return new, painting
+    return reference, new, painting
 
 
 def _with_reference(painting: Propagation, view: ViewMasks, appearance: Appearance) -> Propagation:

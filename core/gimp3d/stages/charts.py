@@ -40,7 +40,7 @@ class ChartSettings:
     least: float = 0.1  # share of the points that a plane must hold
     most: int = 3  # a floor and two walls
     search: float = 0.12  # how far photos may move a plane along its normal
-    precise: float = 6e-4  # to what it is settled
+    precise: float = 1e-4  # to what it is settled
     rival: float = 1.1  # how much better photos must agree on a plane of its own than on a better one, for its points
     relief: float = 0.9  # share of what photos disagree on, on the plane, that a relief may leave
     height: float = 0.25  # of a relief at most; what is higher stands on the surface

@@ -26,7 +26,7 @@ class ClearingSettings:
     """When a Gaussian is haze, and what a view's target is."""
 
     object_weight: float = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
-    some_weight: float = 0.02  # and from which it may show some of it
+    some_weight: float = 0.1  # and from which it may show some of it
     rim: int = 1  # px by which the object is larger in the photo than in the splats
     observed: float = 0.5  # share of a Gaussian's weight that photos must show
     shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
@@ -146,10 +146,10 @@ def chart_targets(
         target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
         target &= met & ~before & (hidden | touched) & ~view.occluder
-        silhouette, before_ = hidden, view.depth_before
+        silhouette, before_ = hidden | witnesses[k].beside, view.depth_before
         mark = extra[k]
         if mark is not None:
-            silhouette, target, before_ = hidden | mark, target | mark, np.where(mark, 0, view.depth_before)
+            silhouette, target, before_ = silhouette | mark, target | mark, np.where(mark, 0, view.depth_before)
         return replace(
             view,
             silhouette=silhouette,
