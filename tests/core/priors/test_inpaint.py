@@ -7,9 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx_files import Shape, combined, model, pixelwise
+from property_tests import examples
 
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.io.images import write_png
@@ -217,7 +218,7 @@ def test_surfaces_without_sense_still_give_a_fill(value: float) -> None:
     assert error(done.image, picture, hole) < 60
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 2**31), st.integers(6, 40), st.integers(6, 40), st.booleans(), st.floats(0.02, 0.98))
 def test_any_hole_is_filled_with_colours_that_the_picture_may_hold(
     seed: int, height: int, width: int, guided: bool, share: float
