@@ -126,7 +126,7 @@ class Picture:
     kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
     data: tuple[np.ndarray, ...]
 
 
@@ -473,9 +473,9 @@ def preview(
 
 def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
     """How the depth prior was scaled, if there was one."""
-    if len(completed.gradients) == 0:
+    if len(completed.ring) == 0:
         return []
-    data = (completed.gradients, np.array([completed.scale_factor]))
+    data = (completed.ring, np.array(completed.line), np.array([completed.scale_factor]))
     return [Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data)]
 
 
