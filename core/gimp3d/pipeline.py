@@ -345,6 +345,7 @@ def _fill_from_one_view(
         f"appearance{suffix}",
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
+    run.warnings += appearance.warnings
     seeds = seed_gaussians(view.camera, appearance.image, depth, view.target, filled.is_surfels, settings.seed)
     if len(seeds) == 0:
         raise IllPosed(f"reference {view.camera.id}: what is behind the object is infinitely far; nothing to build")
@@ -443,7 +444,7 @@ def _complete_depth(
         spec = "auto"
     if spec.startswith("onnx:"):
         if given is not None:
-            picture = paste_picture(base, view.target, given, "--reference-image").image
+            picture = paste_picture(base, view.target, given, "--reference-image", ~view.silhouette).image
         else:
             picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
     prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
@@ -490,7 +491,7 @@ def _appearance(
 ) -> Appearance:
     """The reference without the object: the given picture, or what photos show and the provider's fill for the rest."""
     if given is not None:
-        return paste_picture(base, view.target, given, "--reference-image")
+        return paste_picture(base, view.target, given, "--reference-image", ~view.silhouette)
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
