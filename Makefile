@@ -25,6 +25,8 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -m "not slow"
 
+# property tests at random, with five times as many examples
+test-all: export HYPOTHESIS_PROFILE = thorough
 test-all: $(READY) lint
 	$(BIN)/python -m pytest
 	$(BIN)/python scripts/test_blenders.py

@@ -34,9 +34,9 @@ def markdown(results: Row) -> str:
         "## The scale of a prior\n",
         "RMSE of disparity in the hole, % of its range, mean over random reliefs; the prior has unknown gain and "
         "shift, and smooth errors as given. Membrane: the paper's form; plate: this program's, which continues the "
-        "prior's error by a thin plate. Best: the s_f (of 7 for the plate) that gives the least error, known from the "
-        "true surface. Worse: share of cases in which "
-        "the measured s_f does worse than none by more than 10 % (and by more than 0.1 % of the range).\n",
+        "prior's error by a thin plate or its average. Best: the s_f (of 7 for the plate) that gives the least error, "
+        "known from the true surface. Worse: share of cases in which the measured s_f does worse than none by more "
+        "than 10 % (and by more than 0.1 % of the range).\n",
         scale_table(results["scale"]),
         "## Surfaces on random places\n",
         "Relative depth error in the hole, %: median / 95 %, means over places. Planes: share in which auto took "

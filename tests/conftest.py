@@ -1,19 +1,25 @@
-"""Fixtures shared by all tests."""
+"""Fixtures shared by all tests, and the examples that property tests try: HYPOTHESIS_PROFILE=thorough for more."""
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
 
+from property_tests import register_profiles
 from scenes import REGION, cameras, scene
 
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
+
+register_profiles()
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -135,7 +135,7 @@ class Picture:
     kind: str  # mask | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (depth, target) | (gradients, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
     data: tuple[np.ndarray, ...]
 
 
@@ -530,6 +530,7 @@ def _fill_from_one_view(
         f"appearance{suffix}",
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
     )
+    run.warnings += appearance.warnings
     name = view.camera.id
     run.pictures += [
         Picture("depth", f"Completed surface in {name}", appearance.image, (depth, view.target)),
@@ -669,13 +670,15 @@ def _complete_depth(
         share = float((there[view.target] > 0).mean())
         words = f"{share:.0%} of the hole lies on charts"
         known = np.ones(depth.shape, np.float32)
-        return DepthCompletion(disparity_of(depth), depth, known, 0.0, np.zeros((0, 2), np.float32), 0, 0, share, words)
+        return DepthCompletion(
+            disparity_of(depth), depth, known, 0.0, np.zeros((0, 2), np.float32), (0.0, 0.0), 0, 0, share, words
+        )
     picture, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:
         spec = "auto"
     if spec.startswith("onnx:"):
         if given is not None:
-            picture = paste_picture(base, view.target, given, "--reference-image").image
+            picture = paste_picture(base, view.target, given, "--reference-image", ~view.silhouette).image
         else:
             picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
     prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
@@ -705,9 +708,9 @@ def preview(
 
 def _fit_picture(completed: DepthCompletion, image: np.ndarray, name: str) -> list[Picture]:
     """How the depth prior was scaled, if there was one."""
-    if len(completed.gradients) == 0:
+    if len(completed.ring) == 0:
         return []
-    data = (completed.gradients, np.array([completed.scale_factor]))
+    data = (completed.ring, np.array(completed.line), np.array([completed.scale_factor]))
     return [Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data)]
 
 
@@ -722,7 +725,7 @@ def _appearance(
 ) -> Appearance:
     """The reference without the object: the given picture, or what photos show and the provider's fill for the rest."""
     if given is not None:
-        return paste_picture(base, view.target, given, "--reference-image")
+        return paste_picture(base, view.target, given, "--reference-image", ~view.silhouette)
     seen = np.zeros_like(view.target)
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.

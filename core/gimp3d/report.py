@@ -81,7 +81,7 @@ def draw(picture: Picture) -> np.ndarray:
     if picture.kind == "depth":
         return relief(picture.data[0], picture.data[1])
     if picture.kind == "fit":
-        return fit_plot(picture.data[0], picture.data[1])
+        return fit_plot(picture.data[0], picture.data[1], picture.data[2])
     if picture.kind == "mapping":
         return offset_colours(picture.image, *picture.data)
     if picture.kind == "rules":
@@ -128,34 +128,45 @@ def relief(
 
 
 def fit_plot(
-    gradients: np.ndarray,  # [N, 2] (prior's, scene's) differences of disparity on the ring round the hole
-    scale: np.ndarray,  # s_f, one number; 0 = the prior is not used
+    ring: np.ndarray,  # [N, 2] (prior, scene's disparity) of pixels round the hole
+    line: np.ndarray,  # [2] (slope, offset) fitted to them
+    scale: np.ndarray,  # s_f, one number: the slope as far as the prior is believed; 0 = it is not used
     size: int = 480,  # px
 ) -> np.ndarray:
-    """How s_f was measured: the scene's gradients over the prior's, and the line fitted; [size, size, 3] uint8."""
-    ink, faint, dots, line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
+    """How s_f was measured: the scene's disparity over the prior, and the line fitted; [size, size, 3] uint8."""
+    ink, faint, dots, drawn_line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
     font, low, high = cv2.FONT_HERSHEY_SIMPLEX, 56, size - 56
     drawn = np.full((size, size, 3), 255, np.uint8)
-    reach = np.maximum(np.percentile(np.abs(gradients), 99, axis=0), 1e-9) * 1.05  # outliers stay outside
-    middle, half = (low + high) / 2, (high - low) / 2
-    for share in (-1, -0.5, 0, 0.5, 1):
-        at = round(middle + share * half)
+    ends = np.percentile(ring, [1, 99], axis=0)  # outliers stay outside
+    middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
+    first, last = middle - half, middle + half
+
+    def place(points: np.ndarray) -> np.ndarray:
+        """Pixels [..., 2] of (prior, disparity)."""
+        share = (points - first) / (last - first)
+        return np.stack([low + share[..., 0] * (high - low), high - share[..., 1] * (high - low)], -1)
+
+    for share in (0, 0.25, 0.5, 0.75, 1):
+        at = round(low + share * (high - low))
+        value = first + share * (last - first)
         cv2.line(drawn, (at, low), (at, high), faint, 1)
-        cv2.line(drawn, (low, at), (high, at), faint, 1)
-        cv2.putText(drawn, f"{share * reach[0]:.2g}", (at - 20, high + 20), font, 0.38, ink, 1, cv2.LINE_AA)
-        cv2.putText(drawn, f"{-share * reach[1]:.2g}", (6, at + 4), font, 0.38, ink, 1, cv2.LINE_AA)
-    places = middle + gradients / reach * [half, -half]
-    inside = (np.abs(gradients) <= reach).all(1)
-    for x, y in np.rint(places[inside]).astype(int):
+        cv2.line(drawn, (low, low + high - at), (high, low + high - at), faint, 1)
+        cv2.putText(drawn, f"{value[0]:.3g}", (at - 20, high + 20), font, 0.38, ink, 1, cv2.LINE_AA)
+        cv2.putText(drawn, f"{value[1]:.3g}", (6, low + high - at + 4), font, 0.38, ink, 1, cv2.LINE_AA)
+    inside = ((ring >= first) & (ring <= last)).all(1)
+    for x, y in np.rint(place(ring[inside])).astype(int):
         cv2.circle(drawn, (int(x), int(y)), 1, dots, -1, cv2.LINE_AA)
-    rise = float(scale.ravel()[0]) * reach[0] / reach[1] * half
-    ends = [(round(middle - half), round(middle + rise)), (round(middle + half), round(middle - rise))]
-    _, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), *ends)
-    cv2.line(drawn, start, end, line, 2, cv2.LINE_AA)
+    fitted = place(np.array([(m, line[0] * m + line[1]) for m in (first[0], last[0])]))
+    if np.abs(fitted).max() < 1e6:  # OpenCV's coordinates are short
+        start, end = ((round(float(x)), round(float(y))) for x, y in fitted)
+        seen, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), start, end)
+        if seen:
+            cv2.line(drawn, start, end, drawn_line, 2, cv2.LINE_AA)
     words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
-    cv2.putText(drawn, words, (low, 36), font, 0.65, line, 2, cv2.LINE_AA)
-    cv2.putText(drawn, "gradient of the prior", (size // 2 - 72, size - 12), font, 0.45, ink, 1, cv2.LINE_AA)
-    cv2.putText(drawn, "gradient of the scene", (size - 204, 36), font, 0.45, ink, 1, cv2.LINE_AA)
+    words += f" (fitted {float(line[0]):.3g})"
+    cv2.putText(drawn, words, (low, 24), font, 0.55, drawn_line, 2, cv2.LINE_AA)
+    cv2.putText(drawn, "prior", (size // 2 - 16, size - 12), font, 0.45, ink, 1, cv2.LINE_AA)
+    cv2.putText(drawn, "disparity of the scene", (6, 46), font, 0.45, ink, 1, cv2.LINE_AA)
     return drawn
 
 

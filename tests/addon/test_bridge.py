@@ -10,9 +10,10 @@ import bpy
 import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from mathutils import Euler, Matrix, Vector
+from property_tests import examples
 from scenes import cameras, scene
 
 from gimp3d.box import Box
@@ -21,7 +22,7 @@ from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.pipeline import render_bytes
 from gimp3d_addon import bridge
 
-NO_FIXTURE_CHECK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+NO_FIXTURE_CHECK = examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def add_camera(name: str = "cam") -> bpy.types.Object:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.box import Box, box_from_matrix, in_region, read_region
 from gimp3d.errors import BadInput
@@ -17,7 +18,7 @@ from gimp3d.gaussians import quats_to_matrices
 NUMBERS = st.floats(-3, 3)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(center=st.tuples(*[NUMBERS] * 3), size=st.tuples(*[st.floats(0.1, 4)] * 3), quat=st.tuples(*[NUMBERS] * 4))
 def test_contains_is_the_definition(center, size, quat) -> None:
     if np.linalg.norm(quat) < 0.1:
@@ -33,7 +34,7 @@ def test_contains_is_the_definition(center, size, quat) -> None:
     assert box.contains(inner).all()
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(quat=st.tuples(*[NUMBERS] * 4), scale=st.tuples(*[st.floats(0.1, 3)] * 3), mirror=st.booleans())
 def test_a_matrix_and_its_box_hold_the_same_points(quat, scale, mirror) -> None:
     if np.linalg.norm(quat) < 0.1:

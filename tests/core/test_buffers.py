@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gimp3d import buffers
@@ -24,7 +24,6 @@ def address(array):
     return array.ctypes.data
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.integers(0, 40), min_size=1, max_size=3),
     st.sampled_from([np.float32, np.int64, np.int16, np.uint8]),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.camera import Camera
 from gimp3d.gaussians import matrices_to_quats, quats_to_matrices
@@ -13,7 +14,7 @@ from gimp3d.orbit import look_at
 VALUES = st.floats(-4, 4)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(eye=st.tuples(*[VALUES] * 3), fx=st.floats(20, 900), cx=st.floats(-50, 300), depth=st.floats(0.1, 50))
 def test_unproject_inverts_project(eye, fx, cx, depth) -> None:
     if np.linalg.norm(eye[:2]) < 0.1:
@@ -38,7 +39,7 @@ def test_the_centre_of_pixel_zero_is_half() -> None:
     np.testing.assert_array_equal(camera.pixel_centres()[1, 3], [3.5, 1.5])
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(factor=st.floats(0.1, 4))
 def test_scaling_moves_pixels_with_the_size(factor: float) -> None:
     camera = Camera("c", 101, 67, 90, 95, 48, 30, np.eye(4))
@@ -48,7 +49,7 @@ def test_scaling_moves_pixels_with_the_size(factor: float) -> None:
     np.testing.assert_allclose(scaled.project(points)[0], camera.project(points)[0] * ratio, rtol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(quat=st.tuples(*[VALUES] * 4))
 def test_quaternions_and_matrices_invert_each_other(quat) -> None:
     if np.linalg.norm(quat) < 0.1:

@@ -67,18 +67,22 @@ def test_every_kind_of_picture_is_drawn(picture: Picture) -> None:
         assert (drawn[:, :30] != IMAGE).any() or (drawn[:, -30:] != IMAGE).any()
 
 
-@pytest.mark.parametrize("scale", [0.4, 3.0, 0.0])
-def test_the_fit_of_a_prior_is_drawn_with_its_line(scale: float) -> None:
-    prior = np.random.default_rng(0).normal(size=(800, 1))
-    noise = 0.1 * np.random.default_rng(1).normal(size=(800, 1))
-    drawn = draw(Picture("fit", "", IMAGE, (np.hstack([prior, scale * prior + noise]), np.array([scale]))))
+@pytest.mark.parametrize("slope", [0.4, 3.0, -1.0])
+@pytest.mark.parametrize("tilt", [1.0, 0.5])
+def test_the_fit_of_a_prior_is_drawn_with_its_line(slope: float, tilt: float) -> None:
+    prior = 7 + np.random.default_rng(0).normal(size=800)
+    scene = slope * prior + 2 + 0.1 * abs(slope) * np.random.default_rng(1).normal(size=800)
+    ring, line = np.stack([prior, scene], -1), np.array([tilt * slope, 2 + (1 - tilt) * slope * 7])
+    drawn = draw(Picture("fit", "", IMAGE, (ring, line, np.array([0.9 * slope]))))
     assert drawn.shape == (480, 480, 3)
-    line = (drawn[60:420, 60:420] == (198, 81, 2)).all(-1)
-    rows, cols = np.nonzero(line)
-    slope = np.polyfit(cols, rows, 1)[0]
-    assert len(rows) > 300 and (slope < -0.5 if scale else abs(slope) < 0.02)
-    assert (drawn == (94, 85, 163)).all(-1).sum() > 600  # a dot per pair, none hidden but by others and the line
+    inner = drawn[60:420, 60:420]
+    on_line, dots = (np.nonzero((inner == colour).all(-1)) for colour in ((198, 81, 2), (94, 85, 163)))
+    assert len(on_line[0]) > 300 and len(dots[0]) > 600  # hardly a dot is hidden by others and the line
+    ratio = np.polyfit(*on_line[::-1], 1)[0] / np.polyfit(*dots[::-1], 1)[0]
+    assert abs(ratio - tilt) < 0.05  # the line is the one that was fitted, among the dots
+    middle = np.abs(on_line[1] - 180) < 5
+    assert abs(on_line[0][middle].mean() - dots[0][np.abs(dots[1] - 180) < 5].mean()) < 8
 
 
 def test_a_fit_of_a_constant_prior_is_drawn() -> None:
-    draw(Picture("fit", "", IMAGE, (np.zeros((40, 2)), np.array([0.0]))))
+    draw(Picture("fit", "", IMAGE, (np.full((40, 2), 3.0), np.zeros(2), np.array([0.0]))))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
@@ -140,8 +141,20 @@ def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -
     write_png(tmp_path / "true.png", render_bytes(truth(), reference))
     out = tmp_path / "out.ply"
     given = ("--reference", reference.id, "--reference-image", str(tmp_path / "true.png"))
-    remove(scene_folder, out, *given, "--views-out", str(tmp_path / "views"))
+    remove(scene_folder, out, *given, "--views-out", str(tmp_path / "views"), "--summary", str(tmp_path / "s.json"))
     assert (read_image(tmp_path / "views" / f"{reference.id}.png").shape) == (90, 120, 3)
+    assert not [w for w in json.loads((tmp_path / "s.json").read_text())["warnings"] if "--reference-image" in w]
+
+
+def test_a_given_picture_that_matches_poorly_is_a_warning(scene_folder: Path, tmp_path: Path) -> None:
+    reference = cameras()[0]
+    true = render_bytes(truth(), reference)
+    scratches = 300 * cv2.GaussianBlur(np.random.default_rng(0).normal(size=(90, 120, 1)), (0, 0), 1.5)
+    write_png(tmp_path / "scratched.png", np.clip(true + scratches[..., None], 0, 255).astype(np.uint8))
+    given = ("--reference", reference.id, "--reference-image", str(tmp_path / "scratched.png"))
+    remove(scene_folder, tmp_path / "out.ply", *given, "--summary", str(tmp_path / "s.json"))
+    warnings = [w for w in json.loads((tmp_path / "s.json").read_text())["warnings"] if "--reference-image" in w]
+    assert len(warnings) == 1 and "agrees by 0." in warnings[0]
 
 
 def test_extra_masks_are_filled_too(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

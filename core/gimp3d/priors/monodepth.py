@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..solvers.robust import robust_fit
 from .onnx import OnnxModel, read_model
 
 KINDS = ("disparity", "depth", "metric")
@@ -109,12 +110,7 @@ def _affine(m: np.ndarray, disparity: np.ndarray) -> tuple[float, float]:
         return 0.0, 0.0
     middle, spread = m.mean(), m.std()
     rows = np.stack([(m - middle) / spread, np.ones_like(m)], -1) * disparity[:, None]
-    weight = np.ones(len(m))
-    for _ in range(10):
-        a, b = np.linalg.lstsq(rows * weight[:, None], weight, rcond=None)[0]
-        residual = np.abs(rows @ [a, b] - 1)
-        scale = 1.4826 * np.median(residual) + 1e-12
-        weight = np.maximum(1 - np.minimum(residual / (4.7 * scale), 1) ** 2, 0)
+    (a, b), _ = robust_fit(rows, np.ones(len(m)))
     return float(a / spread), float(b - a * middle / spread)
 
 

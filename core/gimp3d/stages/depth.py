@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,10 +14,9 @@ from ..priors.monodepth import DepthPrior, relative_disparity
 from ..solvers.poisson import solve_poisson
 from .depth_evidence import DepthEvidence, free_space, gather_depth_evidence
 from .depth_fill import DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
+from .depth_prior import PriorFit, fit_prior
 from .layers import AROUND, distance_to, without_front
 from .masks import ViewMasks
-
-SHOWN = 1500  # pairs of gradients kept for the fit's picture
 
 __all__ = ["DepthCompletion", "DepthSettings", "PriorFit", "complete_depth", "complete_disparity", "fit_prior"]
 
@@ -30,7 +29,8 @@ class DepthCompletion:
     depth: np.ndarray  # [H, W] float32 z-depth; 0 where disparity is 0
     trust: np.ndarray  # [H, W] float32, each pixel's confidence; 1 off the hole
     scale_factor: float  # s_f used; 0 = no guidance
-    gradients: np.ndarray  # [N, 2] float32 (prior's, scene's) differences on the ring that s_f was measured by
+    ring: np.ndarray  # [N, 2] float32 (prior, scene's disparity) of ring pixels, to which s_f was fitted
+    line: tuple[float, float]  # (slope, offset) of that fit; s_f is the slope as far as the prior is believed
     clamped: int  # pixels whose disparity had to be clamped
     contradicted: int  # pixels that other views see past
     confidence: float  # 0 to 1
@@ -148,60 +148,78 @@ def complete_disparity(
         usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
         weight[usable], scene[usable] = evidence.weight[usable], evidence.disparity[usable]
     around = surroundings(scene, trusted, hole, weight, settings)
-    guide, fit = None, PriorFit(0.0, 0.0, 1.0, "")
+    guide, fit, on_line = None, PriorFit(0.0, 0.0, 1.0, ""), trusted
     if prior is not None:
         fit = fit_prior(scene, around.measured, hole, prior, settings, on_ring=bool(around.touching.any()))
-        guide = fit.scale * _without_gaps(prior) if fit.scale else None
+        if fit.scale:
+            guide, on_line = fit.guide_scale * _without_gaps(prior), trusted & fit.agrees(prior, scene)
     if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     result, trust = scene.copy(), np.ones(hole.shape)
     done: list[_Settled] = []
-    most_sure = fit.confidence
+    most_sure, used = 1.0, fit.scale
     reasons: list[str] = [fit.reason]
     for part in _parts(hole, settings.small_part):
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = _window(part, settings.planes.ring + 1) if near else np.s_[:, :]
-        inside = part[window]
-        own_guide = None if guide is None else guide[window]
-        around = surroundings(scene[window], trusted[window], inside, (weight * part)[window], settings, own_guide)
-        surface = "harmonic" if part.sum() <= settings.small_part else settings.surface
-        plan = choose_plan(around, replace(settings, surface=surface), insist=not done)
-        missed = withheld_miss(around, plan, settings, around.rim)
-        filled = fill(around, plan, settings)
-        if own_guide is not None and settings.scale_factor is None and surface not in ("harmonic", "planar"):
-            filled, believed = _as_far_as_believed(filled, missed, around, settings)
-            if believed < 0.95:
-                reasons.append(f"prior believed by {believed:.0%}, as the surroundings are told better without it")
+        inside, evident = part[window], (weight * part)[window]
+        around = surroundings(scene[window], trusted[window], inside, evident, settings)
+        own = replace(settings, surface="harmonic" if part.sum() <= settings.small_part else settings.surface)
+        sure = fit.confidence
+        if guide is None:
+            plan = choose_plan(around, own, insist=not done)
+            missed, filled = withheld_miss(around, plan, settings, around.rim), fill(around, plan, settings)
+        else:
+            guided = surroundings(scene[window], on_line[window], inside, evident, settings, guide[window])
+            if not guided.touching.any():
+                guided = replace(around, guide=guide[window])
+            plan = choose_plan(guided, own)
+            missed = withheld_miss(guided, plan, settings, guided.rim)
+            filled, believed = _as_far_as_believed(fill(guided, plan, settings), missed, fit, guided, around, own)
+            if not done:  # the largest part's
+                used = believed * fit.guide_scale
+                reasons.append("" if believed > 0.95 else f"prior believed by {believed:.0%}")
+            around, sure = guided, max(sure, believed)
         settled = _settle(filled, around, fit.shift, settings)
         result[window][inside] = settled.disparity[inside]
-        trust[window][inside] = (settled.share * fit.confidence * _trust(around, missed, settings))[inside]
+        trust[window][inside] = (settled.share * sure * _trust(around, missed, settings))[inside]
         reasons += [*([] if done else [plan.reason]), *settled.notes]
         done.append(settled)
         if part.sum() > 0.05 * hole.sum():
-            most_sure = min(most_sure, settled.share)
+            most_sure = min(most_sure, settled.share, sure)
     confidence = min(float(trust[hole].mean()), most_sure)
     reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
     clamped = sum(s.clamped for s in done)
-    return _completion(result, replace(fit, confidence=confidence, reason=reason), trust, clamped)
+    return _completion(result, replace(fit, scale=used, confidence=confidence, reason=reason), trust, clamped)
 
 
 def _as_far_as_believed(
-    guided: np.ndarray,  # [H, W] the hole's disparity with the prior
+    filled: np.ndarray,  # [H, W] the hole's disparity with the prior
     missed: float,  # by it on the withheld band
-    around: Surroundings,
+    fit: PriorFit,
+    guided: Surroundings,
+    alone: Surroundings,  # without the prior
     settings: DepthSettings,
 ) -> tuple[np.ndarray, float]:
-    """The hole with as much of the prior as its miss on a withheld band allows, and how much that is.
+    """The hole with as much of the prior as its fit and its miss on a withheld band allow, and how much that is.
 
-    Gradients tell a prior's scale, but not that its error is larger than what planes or a plate miss without it.
+    The fit tells a prior's scale, but not that its error is larger than what planes or a plate miss without it.
     """
-    alone = replace(around, guide=None)
-    plan = choose_plan(alone, settings, insist=False)
-    ratio = missed / max(withheld_miss(alone, plan, settings, around.rim), 1e-9)
-    believed = 1.0 if np.isnan(ratio) else 1 / (1 + (ratio / settings.prior_miss) ** 8)
+    if settings.scale_factor is not None:
+        return filled, fit.believed
+    plan, believed = choose_plan(alone, settings, insist=False), fit.believed
+    if settings.surface not in ("harmonic", "planar"):
+        ratio = missed / max(withheld_miss(alone, plan, settings, guided.rim), 1e-9)
+        if not np.isnan(ratio):
+            believed = max(believed, _falling(ratio / settings.prior_gain)) * _falling(ratio / settings.prior_miss)
     if believed >= 0.99:
-        return guided, 1.0
-    return believed * guided + (1 - believed) * fill(alone, plan, settings), believed
+        return filled, 1.0
+    return believed * filled + (1 - believed) * fill(alone, plan, settings), believed
+
+
+def _falling(ratio: float) -> float:
+    """From 1 to 0, ½ at a ratio of 1."""
+    return 1 / (1 + ratio**8)
 
 
 def _without_gaps(prior: np.ndarray) -> np.ndarray:
@@ -218,62 +236,6 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     large = [labels == k for k in np.argsort(-sizes, kind="stable") if sizes[k] > small]
     rest = hole & (sizes[labels] <= small)
     return [*large, rest] if rest.any() else large
-
-
-@dataclass(frozen=True)
-class PriorFit:
-    """How a relative prior turns into the scene's disparity: scale · prior + shift. Scale 0: not at all."""
-
-    scale: float  # s_f
-    shift: float  # matters only where the hole has no rim
-    confidence: float
-    reason: str
-    gradients: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))  # [N, 2] (prior's, scene's)
-
-
-def fit_prior(
-    disparity: np.ndarray,  # [H, W]
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    prior: np.ndarray,  # [H, W] relative disparity
-    settings: DepthSettings = DepthSettings(),
-    on_ring: bool = True,  # else on everything known
-) -> PriorFit:
-    """Measure s_f by least squares between gradients on the ring (METHOD section 3).
-
-    Mean gradients are left out: a slope is harmonic, so it needs no prior and says nothing about one. With a noisy
-    prior the best s_f is below the true gain, which is what least squares gives; where ring and prior agree poorly it
-    is lowered further, so that guidance hardly ever does worse than none. 0 where the prior says nothing: too few
-    pixels, no variance, no or negative agreement.
-    """
-    ring = known & (disparity > 0) & np.isfinite(prior)
-    if on_ring:
-        ring &= distance_to(hole) <= settings.ring
-    k, pairs = settings.gradient_step, []
-    for near, far in ((np.s_[:, :-k], np.s_[:, k:]), (np.s_[:-k], np.s_[k:])):
-        both = ring[near] & ring[far]
-        if both.any():
-            steps = np.stack([(prior[far] - prior[near])[both], (disparity[far] - disparity[near])[both]])
-            pairs.append(steps - steps.mean(axis=1, keepdims=True))
-    m, d = np.concatenate([np.zeros((2, 0)), *pairs], axis=1)
-    if len(m) < settings.minimum_ring:
-        return PriorFit(0.0, 0.0, 0.3, "prior not used, too little is known round the hole to scale it")
-    shown = np.stack([m, d], -1)[:: max(1, len(m) // SHOWN)].astype(np.float32)
-
-    def fitted(scale: float, confidence: float, reason: str) -> PriorFit:
-        shift = float(np.median((disparity - scale * prior)[ring])) if scale else 0.0
-        return PriorFit(scale, shift, confidence, reason, shown)
-
-    if settings.scale_factor is not None:
-        return fitted(settings.scale_factor, 0.5, f"guided, s_f = {settings.scale_factor:g} as set")
-    if (m**2).mean() < 1e-12 * max(float(np.abs(prior[ring]).max()) ** 2, 1e-300):
-        return fitted(0.0, 0.3, "prior not used, it is constant round the hole")
-    correlation = float((m * d).sum() / np.sqrt((m**2).sum() * max((d**2).sum(), 1e-300)))
-    if correlation < settings.minimum_correlation:
-        return fitted(0.0, 0.3, f"prior not used, it does not fit the scene (correlation {correlation:.2f})")
-    share = min(1.0, correlation / settings.full_correlation) ** 2
-    scale = share * float((m * d).sum() / (m**2).sum())
-    return fitted(scale, correlation, f"guided, s_f = {scale:.3g} measured on the ring (correlation {correlation:.2f})")
 
 
 def _trust(around: Surroundings, missed: float, settings: DepthSettings) -> np.ndarray:
@@ -322,7 +284,9 @@ def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped
     disparity = disparity.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
     trust = trust.astype(np.float32)
-    return DepthCompletion(disparity, depth, trust, fit.scale, fit.gradients, clamped, 0, fit.confidence, fit.reason)
+    return DepthCompletion(
+        disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, 0, fit.confidence, fit.reason
+    )
 
 
 def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
+from property_tests import examples
 from scipy.spatial import cKDTree
 
 from gimp3d.camera import Camera
@@ -25,7 +26,7 @@ from gimp3d.io.ply import write_gaussians
 from gimp3d.orbit import look_at
 from gimp3d.raster import render
 
-QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+QUICK = examples(25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import Gaussians
@@ -25,7 +26,7 @@ LAYOUTS = {
     "extras in front": ["label", *XYZ, *DC, "opacity", *SCALE, *ROT, "semantic_7"],
 }
 FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+QUICK = examples(60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def make(

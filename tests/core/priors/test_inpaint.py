@@ -7,9 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx_files import Shape, combined, model, pixelwise
+from property_tests import examples
 
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.io.images import write_png
@@ -217,7 +218,7 @@ def test_surfaces_without_sense_still_give_a_fill(value: float) -> None:
     assert error(done.image, picture, hole) < 60
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 2**31), st.integers(6, 40), st.integers(6, 40), st.booleans(), st.floats(0.02, 0.98))
 def test_any_hole_is_filled_with_colours_that_the_picture_may_hold(
     seed: int, height: int, width: int, guided: bool, share: float
@@ -341,6 +342,56 @@ def test_a_shifted_and_relit_picture_is_registered(shift: tuple[float, float]) -
     done = paste_picture(holed(picture, hole), hole, relit)
     assert "shifted" in done.reason
     assert error(done.image, picture, hole) < 2 < error(relit, picture, hole)
+
+
+@pytest.mark.parametrize("balance", [(0.75, 0.75, 0.75), (1.12, 1.0, 0.88)])
+def test_a_picture_takes_the_exposure_and_white_balance_of_the_view_round_the_hole(balance: tuple[float, ...]) -> None:
+    """Though the rest of the view is in another light, and is drawn without its details."""
+    picture, hole = scenery(240, 320), disc(240, 320, 40)
+    lit = np.clip(picture * np.array(balance), 0, 255)
+    y, x = np.mgrid[:240, :320]
+    near = np.hypot(y - 120, x - 160) < 85
+    view = cv2.GaussianBlur(np.where(near[..., None], lit, picture).astype(np.uint8), (0, 0), 2.5)
+    done = paste_picture(holed(view, hole), hole, picture)
+    assert error(done.image, lit, hole) < 1.5 < error(picture, lit, hole)
+    assert "gain" in done.reason and done.warnings == ()
+
+
+def badly_drawn(picture: np.ndarray) -> np.ndarray:
+    """As splats of few views show it: blurred, with haze in patches."""
+    haze = cv2.GaussianBlur(np.random.default_rng(7).normal(size=picture.shape), (0, 0), 12) * 600
+    return np.clip(0.3 * cv2.GaussianBlur(picture, (0, 0), 4) + 90 + haze, 0, 255).astype(np.uint8)
+
+
+def test_a_picture_of_a_badly_drawn_view_is_pasted_with_a_warning() -> None:
+    picture, hole = scenery(240, 320), disc(240, 320, 40)
+    view = holed(badly_drawn(picture), hole)
+    done = paste_picture(view, hole, picture, "photo.png")
+    (warning,) = done.warnings
+    assert warning.startswith("photo.png matches the view poorly: outside the hole it agrees by 0.")
+    assert "grey levels" in warning and done.confidence < 0.6
+    with pytest.raises(BadInput, match="does not match the view"):
+        paste_picture(view, hole, scenery(240, 320, seed=9))
+
+
+def test_where_the_view_is_not_known_a_picture_is_not_compared() -> None:
+    """What stands in the object's place is drawn from splats that it hid."""
+    picture, hole = scenery(240, 320), disc(240, 320, 30)
+    silhouette = disc(240, 320, 90)
+    view = np.where(silhouette[..., None], np.uint8(70), picture)
+    with_it = paste_picture(view, hole, picture, known=~silhouette)
+    assert (with_it.image[hole] == picture[hole]).all() and with_it.confidence > 0.95
+    assert (paste_picture(view, hole, picture).image[hole] != picture[hole]).any()
+
+
+def test_a_command_may_be_warned_about(tmp_path: Path) -> None:
+    """A warning comes through a provider to whoever asked it."""
+    picture, hole = scenery(240, 320), disc(240, 320, 40)
+    path = tmp_path / "photo.png"
+    write_png(path, picture)
+    body = f"shutil.copy({str(path)!r}, out)"
+    done = inpaint_reference(script(tmp_path, body), holed(badly_drawn(picture), hole), hole)
+    assert len(done.warnings) == 1 and "matches the view poorly" in done.warnings[0]
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from brute_force import draw
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, one, random_scene
 
 from gimp3d.raster import RasterSettings, contributions, footprint, render
@@ -45,7 +46,7 @@ def test_a_footprint_matches_the_reference(seed: int) -> None:
     np.testing.assert_allclose(footprint(gaussians, CAMERA, chosen, EVERY_ALPHA), expected, atol=1e-4)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_the_footprints_of_a_partition_sum_to_alpha(seed: int, parts: int) -> None:
     gaussians = random_scene(seed, 40, 0)

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, random_scene
 
 from gimp3d.raster import (
@@ -32,7 +33,7 @@ def rectangle(rng: np.random.Generator) -> np.ndarray:
     return pixels
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 10**6), st.booleans())
 def test_a_part_of_a_view_has_the_whole_views_pixels(seed: int, surfels: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -45,7 +46,7 @@ def test_a_part_of_a_view_has_the_whole_views_pixels(seed: int, surfels: bool) -
         np.testing.assert_array_equal(a[pixels], b[pixels])
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.integers(0, 10**6), st.booleans())
 def test_what_is_gone_might_never_have_been_there(seed: int, surfels: bool) -> None:
     gaussians = random_scene(seed, 200, 0, surfels=surfels)
@@ -76,7 +77,7 @@ def test_colours_and_footprints_need_drawings_of_their_own() -> None:
         drawing(gaussians, WIDE).footprint(np.ones(20, bool))
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.integers(0, 10**6), st.booleans())
 def test_weights_by_label_are_those_of_each_labels_pixels(seed: int, surfels: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -90,7 +91,7 @@ def test_weights_by_label_are_those_of_each_labels_pixels(seed: int, surfels: bo
     np.testing.assert_array_equal(of_rows[:, rows], found[:, rows])
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 10**6), st.booleans(), st.floats(-6, 1))
 def test_nothing_is_drawn_outside_the_touched_window(seed: int, surfels: bool, log_scale: float) -> None:
     gaussians = random_scene(seed, 5, 0, surfels=surfels)

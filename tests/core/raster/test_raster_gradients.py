@@ -7,8 +7,9 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, one, posed, random_scene
 
 from gimp3d import threads
@@ -206,7 +207,7 @@ def test_the_low_pass_matches_the_reference(kind: str) -> None:
         assert errors(tiny, CAMERA, list(OUTPUTS)).max() < TOLERANCE
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(
     seed=st.integers(0, 10**6),
     width=st.integers(1, 45),
@@ -339,7 +340,7 @@ def test_what_is_fully_occluded_or_transparent_gets_no_gradient(kind: str) -> No
     assert not any(a.any() for a in arrays(all_gradients(clear, CAMERA)))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_odd_rows_get_finite_gradients_and_harm_nothing(data: st.DataObject) -> None:
     """Any value in any column; rows that are not drawn get zeros, the others what they get without them."""

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, posed, random_scene
 
 from gimp3d.camera import Camera
@@ -215,7 +216,7 @@ def test_small_moves_do_not_renew_the_layers() -> None:
     assert (region._near != before).any()
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     seed=st.integers(0, 10**4),
     surfels=st.booleans(),

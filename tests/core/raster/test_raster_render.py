@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from brute_force import DEFAULT, draw
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians, matrices_to_quats, quats_to_matrices
@@ -76,7 +77,7 @@ def test_every_sh_degree_matches_the_reference(degree: int) -> None:
     assert_matches_reference(random_scene(degree, degree=degree), posed(CAMERA, degree))
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     seed=st.integers(0, 10**6),
     width=st.integers(1, 50),

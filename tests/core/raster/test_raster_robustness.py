@@ -7,8 +7,9 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, one, random_scene
 
 from gimp3d import threads
@@ -71,7 +72,7 @@ def test_concurrent_and_nested_renders_are_bit_equal_to_single_ones() -> None:
             assert_identical(expected, concurrent[4 * repetition + k])
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_odd_rows_are_ignored_as_usable_says_and_harm_nothing(data: st.DataObject) -> None:
     """Any value in any column: rows that are not `usable` are not drawn, and every picture stays finite."""

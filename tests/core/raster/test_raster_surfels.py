@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from test_raster_render import CAMERA, one, posed, random_scene
 
 from gimp3d.camera import Camera
@@ -74,7 +75,7 @@ def test_other_thresholds_match_the_reference() -> None:
         assert_matches_reference(random_scene(seed, surfels=True), posed(CAMERA, seed), raster)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     seed=st.integers(0, 10**6),
     width=st.integers(1, 50),

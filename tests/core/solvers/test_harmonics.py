@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scipy.special import sph_harm_y
 
 from gimp3d.errors import BadInput
@@ -83,7 +84,7 @@ def test_the_basis_is_the_real_form_of_the_complex_harmonics() -> None:
             np.testing.assert_allclose(sh_basis(d, degree)[:, degree**2 + degree + m], real, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(seed=seeds, degree=st.integers(0, 3), mirrored=st.booleans())
 def test_rotated_coefficients_show_the_same_colours_along_rotated_directions(
     seed: int, degree: int, mirrored: bool
@@ -103,7 +104,7 @@ def test_rotated_coefficients_show_the_same_colours_along_rotated_directions(
 # ------------------------------------------------------------------------------------------------- what a fit must be
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=seeds, degree=st.integers(0, 3), views=st.integers(0, 20), ridge=st.one_of(st.none(), st.floats(0.01, 5)))
 def test_the_reference_colour_is_reproduced_exactly(seed: int, degree: int, views: int, ridge: float | None) -> None:
     rng = np.random.default_rng(seed)
@@ -325,7 +326,7 @@ def test_bad_observations_are_left_out() -> None:
     np.testing.assert_allclose(spoilt.sh, clean.sh, atol=1e-5)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     seed=seeds,
     views=st.integers(1, 40),

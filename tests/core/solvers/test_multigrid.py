@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import scipy.sparse
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from property_tests import examples
 
 from gimp3d.solvers import multigrid
 from gimp3d.solvers.multigrid import Multigrid, places_of
@@ -77,7 +78,7 @@ def precondition(grids, residual):
     return work.p.copy()  # the first direction
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(mask=MASKS.filter(np.any), seed=st.integers(0, 9))
 def test_coarse_operators_are_galerkin_operators(mask, seed):
     grids, matrix, inside, _ = system(mask, seed)
@@ -91,7 +92,7 @@ def test_coarse_operators_are_galerkin_operators(mask, seed):
         matrix = matrix[used.ravel()][:, used.ravel()]
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(mask=MASKS.filter(np.any), seed=st.integers(0, 9))
 def test_no_smoother_diverges(mask, seed):
     """The largest eigenvalue of steps · A stays below 2, whatever the shape of the hole."""

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.jit import kernel
 from gimp3d.solvers.patch_index import Tree, index_patches, leaf_of
@@ -37,7 +38,7 @@ def leaves(tree: Tree, found: np.ndarray) -> np.ndarray:
     return out
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 4), st.floats(0.01, 1), st.integers(0, 2**31))
 def test_every_allowed_patch_of_the_grid_lies_in_one_leaf(
     height: int, width: int, step: int, density: float, seed: int

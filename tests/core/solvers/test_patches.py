@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.solvers.patches import coordinates, lay_out, main_components
 
@@ -34,7 +35,7 @@ def test_rows_of_patches_are_read_where_they_start(radius: int, channels: int) -
     assert patches.weights.sum() * size == pytest.approx(1, rel=1e-6)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.integers(0, 3), st.integers(1, 5), st.integers(0, 2**31), st.sampled_from([1e-3, 1.0, 30.0]))
 def test_coordinates_never_overstate_how_far_patches_differ(
     radius: int, channels: int, seed: int, scale: float

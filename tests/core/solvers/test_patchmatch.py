@@ -6,8 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.solvers.patchmatch import (
     NearestNeighbourField,
@@ -196,7 +197,7 @@ def test_upsampling_doubles_coordinates_and_keeps_parity() -> None:
     assert fine.cols[2:4, 2:4].tolist() == [[6, 6], [6, 6]]  # the seventh column is the last one
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     st.integers(1, 48),
     st.integers(1, 70),

@@ -14,8 +14,9 @@ import pytest
 import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.solvers.poisson import PoissonSettings, solve_hole, solve_poisson
 from gimp3d.threads import parallel_map, set_thread_count
@@ -102,7 +103,7 @@ SHARES = st.sampled_from([0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
 SMALL_MASKS = st.builds(any_mask, st.integers(1, 14), st.integers(1, 14), SHARES, SHARES, st.integers(0, 10_000))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(kinds=SMALL_MASKS, seed=st.integers(0, 99), channels=st.integers(1, 3), single=st.booleans())
 def test_any_mask_solves_as_the_equations_say(kinds, seed, channels, single):
     rng = np.random.default_rng(seed)
@@ -121,7 +122,7 @@ def test_any_mask_solves_as_the_equations_say(kinds, seed, channels, single):
     np.testing.assert_array_equal(solution.values[~hole], values[~hole].astype(solution.values.dtype))
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(kinds=SMALL_MASKS, seed=st.integers(0, 99), guided=st.booleans(), density=st.sampled_from([0.05, 0.5, 1.0]))
 def test_any_mask_with_soft_data_solves_as_the_equations_say(kinds, seed, guided, density):
     """Weights over eight orders of magnitude."""

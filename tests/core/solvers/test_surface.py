@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.solvers import surface as module
 from gimp3d.solvers.surface import coarser, supports, tangent_planes, warps, whole_patches
@@ -32,7 +33,7 @@ def room() -> np.ndarray:
 slopes = st.floats(-0.6, 0.6)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(slopes, slopes, st.floats(0.1, 100))
 def test_a_plane_is_found_exactly(a: float, b: float, distance: float) -> None:
     disparity = plane((a, b, 1), distance)
@@ -43,7 +44,7 @@ def test_a_plane_is_found_exactly(a: float, b: float, distance: float) -> None:
     np.testing.assert_allclose(found.point[..., 2], 1 / disparity, rtol=1e-3)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(slopes, slopes, st.floats(0.5, 20), st.integers(0, H * W - 1), st.integers(0, H * W - 1))
 def test_a_warp_is_the_derivative_of_moving_along_the_plane(
     a: float, b: float, distance: float, p: int, q: int

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.solvers.poisson import solve_poisson
 from gimp3d.solvers.thin_plate import ThinPlateSettings, thin_plate
@@ -16,7 +17,7 @@ HOLE = np.hypot(V - 45, U - 60) < 25
 RING = ~HOLE & (np.hypot(V - 45, U - 60) < 37)
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(st.floats(-5, 5), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_slopes_are_continued_exactly(level, across, down):
     plane = level + across * U + down * V

@@ -255,12 +255,39 @@ def test_planes_are_not_given_up_for_a_prior_that_tells_them_worse():
         assert off < 1.1 * off_none and off < 0.5 * off_measured
 
 
-def test_the_pairs_behind_the_scale_factor_come_with_it():
+def test_what_the_scale_factor_was_fitted_to_comes_with_it():
     truth, _, prior = random_case(4, "terrain", 0)
     found = complete(truth, blob(), prior)
-    m, d = found.gradients.astype(np.float64).T
+    m, d = found.ring.astype(np.float64).T
     assert 500 < len(m) < 4000
-    np.testing.assert_allclose(found.scale_factor, (m @ d) / (m @ m), rtol=0.05)
+    np.testing.assert_allclose(found.line, np.polyfit(m, d, 1), rtol=0.01)
+    np.testing.assert_allclose(found.line[0], found.scale_factor, rtol=0.01)
+
+
+@pytest.mark.parametrize("gain", [0.05, 1.0, 30.0])
+def test_foliage_on_the_ring_does_not_hide_that_a_prior_is_right(gain):
+    """Splats of leaves stand before the ground all over the ring: its small differences are theirs."""
+    truth = FLOOR + 0.06 * np.exp(-((U - 80) ** 2 + (V - 60) ** 2) / 150)  # a mound that the ring does not show
+    rng, hole = np.random.default_rng(3), blob()
+    leaves = ~hole & (cv2.GaussianBlur(rng.standard_normal((H, W)), (0, 0), 1.5) > 0.08)
+    scene = np.where(leaves, truth * rng.uniform(1.1, 1.8, truth.shape), truth)
+    assert 0.2 < leaves[~hole].mean() < 0.4
+    fit = fit_prior(scene, ~hole, hole, truth / gain - 3)
+    np.testing.assert_allclose(fit.scale, gain, rtol=0.02)
+    np.testing.assert_allclose(fit.shift, 3 * gain, rtol=0.05)
+
+
+def test_a_right_prior_tells_of_a_mound_though_the_scan_swirls():
+    """The ring's own relief is noise, which a prior cannot share; that it errs by less than its mound is enough."""
+    hole, errors = blob(), []
+    mound = 0.08 * np.exp(-((U - 80) ** 2 + (V - 60) ** 2) / 150)
+    for seed in range(4):
+        swirls = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((H, W)), (0, 0), 4)
+        scene = FLOOR + mound + 0.004 * swirls / swirls.std()
+        guided, none = (complete_disparity(scene, ~hole, hole, p) for p in (4 * (FLOOR + mound) + 1, None))
+        assert guided.reason.startswith("guided") and "off by" not in guided.reason
+        errors.append([relative_error(x, FLOOR + mound, hole).mean() for x in (guided, none)])
+    assert np.mean(errors, axis=0)[0] < 0.4 * np.mean(errors, axis=0)[1]
 
 
 def test_a_ring_of_fewer_than_ten_pixels_measures_nothing():

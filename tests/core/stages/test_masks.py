@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import BLOCK, REGION, block, cameras, discs, floor, scene, truth
 
 from gimp3d.box import Box, read_region
@@ -105,7 +106,7 @@ def hidden_floor(camera: Camera) -> np.ndarray:
     return (depth > 0) & (np.abs(points[..., :2]) < BLOCK / 2).all(-1)
 
 
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(seed=st.integers(0, 10_000), count=st.integers(5, 12), guessed=st.booleans())
 def test_targets_of_all_views_agree(seed: int, count: int, guessed: bool) -> None:
     """A point that no view saw is in T of every view that frames it unoccluded, up to a 1-px rim; one way or the other.
@@ -361,7 +362,7 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
     assert scale < 1 or masks.selection.count(Fate.KEPT_SURFACE) > 100
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 10**6), st.integers(1, 20), st.integers(1, 20))
 def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: int) -> None:
     rng = np.random.default_rng(seed)

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 import scipy.sparse.linalg
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import cameras, truth
 
 from gimp3d.camera import Camera
@@ -450,7 +451,7 @@ def solved_directly(domain: np.ndarray, weight: np.ndarray, anchor: np.ndarray) 
     return scipy.sparse.linalg.spsolve(matrix.tocsc(), (weight[..., None] * anchor)[domain]).reshape(-1, 3)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(seed=st.integers(0, 10_000), width=st.floats(1.0, 20.0))
 def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
     rng = np.random.default_rng(seed)

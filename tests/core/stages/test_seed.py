@@ -7,9 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from property_tests import examples
 from scenes import cameras, floor, truth
 
 from gimp3d.camera import Camera
@@ -52,7 +53,7 @@ def test_seeds_alone_redraw_the_reference_without_cracks(index: int, surfels: bo
     assert np.median(relative) < 0.015  # the discs of the scene are 3 % of the distance wide
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     arrays(bool, st.tuples(st.integers(1, 30), st.integers(1, 30))),
     st.sampled_from([1, 2, 4, 8]),

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import BLOCK, block, cameras, discs, floor, scene, truth
 from scipy.special import ndtr
 
@@ -37,7 +38,7 @@ def found(gaussians: Gaussians, region: Region = DEEP, clean: Gaussians | None =
     return find_masks(gaussians, region, VIEWS, MaskSettings(selection=SelectionSettings(**changed)), photos=photos)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(seed=st.integers(0, 10_000))
 def test_mass_is_the_integral_over_the_box(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
@@ -81,7 +82,7 @@ def test_surface_is_followed_to_the_object_and_no_further(surface: Height, thing
     assert (off[object_] < SurroundingsSettings().thickness).mean() < 0.01
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(seed=st.integers(0, 10_000))
 def test_turning_the_world_changes_nothing(seed: int) -> None:
     """The box's own axes do not matter: a turned box follows the same floor."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from property_tests import examples
 from scenes import cameras, scene
 
 from gimp3d.camera import Camera
@@ -21,7 +22,7 @@ FAR = np.array([0, 0, 1e6])  # centres beyond all that is seen: tolerances are o
 WHOLE = [(slice(0, c.height), slice(0, c.width)) for c in CAMERAS]
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(seed=st.integers(0, 10_000), tolerance=st.floats(0.001, 0.1))
 def test_a_point_is_shown_or_seen_past_by_a_view_that_is_not_hidden(seed: int, tolerance: float) -> None:
     rng = np.random.default_rng(seed)
