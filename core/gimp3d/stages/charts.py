@@ -43,6 +43,7 @@ class ChartSettings:
     precise: float = 1e-4  # to what it is settled
     rival: float = 1.1  # how much better photos must agree on a plane of its own than on a better one, for its points
     relief: float = 0.9  # share of what photos disagree on, on the plane, that a relief may leave
+    sunk: float = 0.97  # share of the photos' agreement that a plane keeps where it is laid onto the drawn surface
     height: float = 0.25  # of a relief at most; what is higher stands on the surface
     largest: int = 900  # px, side of a chart at most
     witnesses: int = 1  # photos that must show a texel
@@ -330,15 +331,25 @@ def _chart(
     kind, noise = "plane", np.nan
     surface = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)).reshape(-1, 3)
     agreement = textures.agreement(surface)
-    relief, noise, _ = _relief(camera, depth, plane, views, witnesses, settings, diagonal)
-    if relief is not None:
-        x_ = camera.unproject(camera.pixel_centres(), relief.astype(np.float64)).reshape(-1, 3)
-        told_plane, told_relief = agreement, textures.agreement(x_)
-        if 1 - told_relief < settings.relief * (1 - told_plane):
-            kind, depth, surface, agreement = "relief", relief, x_, told_relief
-        words = f"photos agree by {told_plane:.2f} on the plane, {told_relief:.2f} on the relief"
-    else:
-        words = f"photos agree by {agreement:.2f}"
+    drawn = _drawn_surface(camera, depth, plane, views, witnesses, settings, diagonal)
+    words = f"photos agree by {agreement:.2f}"
+    if drawn is not None:
+        noise = float(np.median(np.abs(drawn.offset[drawn.known])))
+
+        def moved(offset: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, float]:
+            z = (depth + offset).astype(np.float32)
+            points = camera.unproject(camera.pixel_centres(), z.astype(np.float64)).reshape(-1, 3)
+            return z, points, textures.agreement(points)
+
+        as_relief = moved(drawn.completed)
+        words = f"photos agree by {agreement:.2f} on the plane, {as_relief[2]:.2f} on the relief"
+        if 1 - as_relief[2] < settings.relief * (1 - agreement):
+            kind, (depth, surface, agreement) = "relief", as_relief
+        else:
+            # splats are drawn a little behind the surface that they show: new ones must lie where they do
+            sunk = moved(float(np.median(drawn.offset[drawn.known])))
+            if sunk[2] >= settings.sunk * agreement:
+                depth, surface, agreement = sunk
     tolerance = _tolerance(surface, witnesses, settings)
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
@@ -409,7 +420,16 @@ def _there(said: np.ndarray) -> np.ndarray:
     return (seen >= through)[rows, cols]
 
 
-def _relief(
+@dataclass(frozen=True)
+class _Drawn:
+    """Where the views' depth maps have a chart's surface; z less that of the plane."""
+
+    offset: np.ndarray  # [h, w] on a coarser grid, median over the views' points
+    known: np.ndarray  # [h, w] bool
+    completed: np.ndarray  # [H, W] float32, continued where there is none
+
+
+def _drawn_surface(
     camera: Camera,
     flat: np.ndarray,  # [H, W] z of the plane
     plane: Plane,
@@ -417,8 +437,8 @@ def _relief(
     witnesses: Sequence[Witness],
     settings: ChartSettings,
     diagonal: float,
-) -> tuple[np.ndarray | None, float, np.ndarray]:
-    """z of the surface as the views' depth maps have it, completed where they have none; median |height|; known."""
+) -> _Drawn | None:
+    """None where the views show too little of it."""
     cells = 2  # px of a chart that share their points
     h, w = -(-camera.height // cells), -(-camera.width // cells)
 
@@ -449,13 +469,11 @@ def _relief(
     value[there] = z[start[there] + count[there] // 2]
     value, there = value.reshape(h, w), there.reshape(h, w)
     if there.sum() < 100:
-        return None, np.nan, there
-    noise = float(np.median(np.abs(value[there] - flat.max())))
+        return None
     offset = np.where(there, value - flat.max(), 0)
-    done = thin_plate(offset, there.astype(float), np.ones((h, w), bool))
-    done = np.nan_to_num(done)
-    full = cv2.resize(done.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR) + flat
-    return full, noise, there
+    done = np.nan_to_num(thin_plate(offset, there.astype(float), np.ones((h, w), bool))).astype(np.float32)
+    size = (camera.width, camera.height)
+    return _Drawn(offset, there, cv2.resize(done, size, interpolation=cv2.INTER_LINEAR))
 
 
 @dataclass(frozen=True)
