@@ -120,18 +120,18 @@ def noisy_depths(relative: float, seed: int) -> Iterator[None]:
 @contextmanager
 def noisy_surfaces(relative: float, seed: int) -> Iterator[None]:
     """The completed surfaces of all references are off by `relative` (one standard deviation) inside."""
-    exact = pipeline.complete_depth
+    exact = pipeline._complete_depth
 
-    def noisy(view: ViewMasks, *given: Any) -> DepthCompletion:
-        done = exact(view, *given)
+    def noisy(view: ViewMasks, *given: Any, **named: Any) -> DepthCompletion:
+        done = exact(view, *given, **named)
         errors = depth_errors(view.camera.id, *done.depth.shape, seed)
         return replace(done, depth=done.depth * (1 + relative * errors))
 
-    pipeline.complete_depth = noisy
+    pipeline._complete_depth = noisy
     try:
         yield
     finally:
-        pipeline.complete_depth = exact
+        pipeline._complete_depth = exact
 
 
 def gathered(

@@ -25,10 +25,21 @@ from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
 from .job import RemovalJob, write_atomically
 from .orbit import measured_up, orbit_cameras
-from .pipeline import PRESETS, STORED, RemovalResult, RemovalSettings, View, preview, remove_object, render_bytes
+from .pipeline import (
+    PRESETS,
+    STORED,
+    RemovalResult,
+    RemovalSettings,
+    View,
+    preview,
+    remove_object,
+    render_bytes,
+    with_charts,
+)
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_removal_report
+from .stages.charts import Chart
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -162,8 +173,10 @@ def write_masks(
         photos,
         _read_extra_masks(extra_masks, looked_at),
     )
-    views = {v.camera.id: v for v in found.views}
     settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
+    drawn = {v.camera.id: render_bytes(gaussians, v.camera) for v in found.views if v.camera.id not in photos}
+    found = with_charts(gaussians, region, found, photos | drawn, settings)
+    views = {v.camera.id: v for v in found.views}
     for camera in written:
         view = views.get(camera.id)
         empty = np.zeros((camera.height, camera.width), bool)
@@ -173,8 +186,8 @@ def write_masks(
             picture = photos.get(camera.id)
             shown = render_bytes(gaussians, view.camera) if picture is None else picture
             target = pictures / output_name(camera.id)
-            for drawn in preview(view, found.views, shown, settings):
-                write_png(target.with_name(f"{target.name}.{drawn.kind}.png"), draw(drawn))
+            for looked in preview(view, found.views, shown, settings):
+                write_png(target.with_name(f"{target.name}.{looked.kind}.png"), draw(looked))
 
 
 def write_orbit(
@@ -232,12 +245,23 @@ def run_removal(
         for name, image in result.painted.items():
             target = Path(job.views_out) / output_name(name)
             write_png(target.with_name(target.name + ".png"), image)
+        _write_charts(Path(job.views_out) / "charts", result.charts)
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), file.gaussians, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
     return summary
+
+
+def _write_charts(folder: Path, charts: Sequence[Chart]) -> None:
+    """The charts' pictures and their cameras (CONTRACT: --views-out)."""
+    if not charts:
+        return
+    for number, chart in enumerate(charts, 1):
+        write_png(folder / f"{number}.png", chart.image)
+    cameras = [replace(chart.camera, id=f"{number}.png") for number, chart in enumerate(charts, 1)]
+    write_transforms(folder / "transforms.json", cameras)
 
 
 def job_settings(job: RemovalJob) -> RemovalSettings:
@@ -360,6 +384,15 @@ def _summary(
             "open_pixels": result.open_pixels,
         },
         "selection": result.selection,
+        "charts": [
+            {
+                "kind": chart.kind,
+                "texels": int(chart.there.sum()),
+                "hole_texels": int(chart.hole.sum()),
+                "photos_median": float(np.median(chart.photos[chart.known])) if chart.known.any() else 0.0,
+            }
+            for chart in result.charts
+        ],
         "references": [asdict(choice) for choice in result.references],
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],

@@ -22,7 +22,7 @@ from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
-from .stages.charts import Chart, ChartSettings, Hits, Plane, draw_charts, find_planes
+from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, draw_charts, find_planes
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
@@ -151,7 +151,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
-    charts: tuple[Chart, ...] = ()
+    charts: tuple[Chart, ...] = ()  # as completed
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
@@ -236,20 +236,13 @@ def remove_object(
         return _finish(run, ~masks.removed, None, masks, (), {}, none)
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
-    kept = scene.take(~masks.removed)
-
-    def level(v: ViewMasks) -> Exposure:
-        """A view's photo at the splats' exposure."""
-        ring = exposure_ring(v)
-        return level_exposure(ring, photos[v.camera.id], render_bytes(kept, v.camera, pixels=ring))
-
-    exposures = dict(zip((v.camera.id for v in masks.views), parallel_map(level, masks.views)))
+    exposures = _exposures(scene, masks, photos)
     levelled = {name: e.image for name, e in exposures.items()}
     open_views = masks.views
     hits: dict[str, Hits] = {}
     charts: tuple[Chart, ...] = ()
     if settings.charts is not None and masks.mode == "need":
-        charted: Charted = run("charts", lambda: _chart(scene, region, masks, levelled, extra_masks or {}, settings))
+        charted: Charted = run("charts", lambda: _chart(scene, region, masks, levelled, settings))
         if charted.charts:
             charts, open_views = charted.charts, charted.targets.views
             hits = {v.camera.id: h for v, h in zip(open_views, charted.targets.hits)}
@@ -273,10 +266,12 @@ def remove_object(
     painted = dict(zip((v.camera.id for v in open_views), parallel_map(emptied, open_views)))
     filled, added = kept, None
     told: dict[str, np.ndarray] = {}  # ID → [H, W] the rule that gave each pixel its last colour
-    as_photo = [None] * (0 if charts else 1 + settings.extra_references)
-    sources: list[Chart | None] = [None] * (1 + settings.extra_references) if charts and reference else []
+    # a picture or a depth that belongs to a view needs that view
+    of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
+    as_photo = not charts or reference is not None or of_view
+    sources: list[Chart | None] = [None] * (as_photo * (1 + settings.extra_references))
     done: list[Reference] = []
-    for round_, chart in enumerate([*sources, *charts, *as_photo]):
+    for round_, chart in enumerate([*sources, *charts]):
         buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
@@ -332,7 +327,37 @@ def remove_object(
         painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
 
     parallel_map(finish, masks.views)
+    pictures = {r.camera.id: r.image for r in done}
+    charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in charts)
     return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left)
+
+
+def _exposures(scene: Gaussians, masks: Masks, photos: Mapping[str, np.ndarray]) -> dict[str, Exposure]:
+    """Every view's photo at the splats' exposure, by ID."""
+    kept = scene.take(~masks.removed)
+
+    def level(v: ViewMasks) -> Exposure:
+        ring = exposure_ring(v)
+        return level_exposure(ring, photos[v.camera.id], render_bytes(kept, v.camera, pixels=ring))
+
+    return dict(zip((v.camera.id for v in masks.views), parallel_map(level, masks.views)))
+
+
+def with_charts(
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
+    settings: RemovalSettings = RemovalSettings(),
+) -> Masks:
+    """The masks that a removal really uses: their targets are what no photo shows of the charts, if there are any."""
+    if settings.charts is None or masks.mode != "need" or not masks.removed.any():
+        return masks
+    levelled = {name: e.image for name, e in _exposures(scene, masks, photos).items()}
+    charted = _chart(scene, region, masks, levelled, settings)
+    if not charted.charts:
+        return masks
+    return replace(masks, selection=charted.selection, views=charted.targets.views)
 
 
 @dataclass(frozen=True)
@@ -351,18 +376,17 @@ def _chart(
     region: Region,
     masks: Masks,
     photos: dict[str, np.ndarray],  # at the splats' exposure
-    extra: Mapping[str, np.ndarray],
     settings: RemovalSettings,
 ) -> Charted:
     """Find the hidden surfaces, clear the air before them, and say where they have to be filled."""
     assert settings.charts is not None
     views = masks.views
-    marked = [extra.get(v.camera.id) for v in views]
+    # what the user named beside the object, by a mask or a box of its own: masks let no depth stand there
+    marked = [v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in views]
 
     objects = object_pixels(scene, masks.removed, views, settings.clearing)
     witnesses = [
-        Witness(v.camera, photos[v.camera.id], o if m is None else o | m, s, v.depth_before)
-        for v, (o, s), m in zip(views, objects, marked)
+        Witness(v.camera, photos[v.camera.id], o | m, s, v.depth_before) for v, (o, s), m in zip(views, objects, marked)
     ]
     planes = find_planes(views, witnesses, region, settings.charts)
     charts = draw_charts(planes, views, witnesses, region, settings.charts)
@@ -397,7 +421,7 @@ def _fill_from_chart(
     appearance: Appearance = run(
         f"appearance{suffix}",
         lambda: inpaint_reference(
-            settings.inpaint,
+            "exemplar" if settings.inpaint.startswith("file:") else settings.inpaint,  # a file shows one view
             chart.image,
             hole,
             settings.random_seed,
@@ -578,7 +602,8 @@ def _carried(
     settings: RemovalSettings,
 ) -> tuple[Reference, Gaussians, Propagation]:
     """A completed reference in every view, and the Gaussians that show it."""
-    seeds = seed_gaussians(camera, appearance.image, depth, target, filled.is_surfels, settings.seed)
+    at_chart = camera.split == CHART
+    seeds = seed_gaussians(camera, appearance.image, depth, target, filled.is_surfels, settings.seed, at_chart)
     if len(seeds) == 0:
         raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
     with_seeds = filled.extended(seeds)

@@ -21,7 +21,7 @@ HERE[5:12, 8:20] = True
 
 def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
     views = [View(c, render_bytes(scene(), c)) for c in cameras(4)]
-    result = remove_object(scene(), views, REGION, RemovalSettings(extra_references=0))
+    result = remove_object(scene(), views, REGION, RemovalSettings(charts=None, extra_references=0))
     summary = {
         "version": "0",
         "seconds_total": 1.0,

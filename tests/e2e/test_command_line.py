@@ -118,7 +118,7 @@ def test_json_progress_ends_with_the_summary(
     remove(scene_folder, tmp_path / "out.ply", "--progress", "json")
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert all({"stage", "done", "total", "message"} <= set(line) for line in lines[:-1])
-    assert {"masks", "depth", "mapping", "propagate", "seed"} <= {line["stage"] for line in lines}
+    assert {"masks", "charts", "mapping", "propagate", "seed"} <= {line["stage"] for line in lines}
     assert lines[-1]["stage"] == "done" and lines[-1]["summary"]["counts"]["removed"] > 0
 
 

@@ -22,7 +22,7 @@ def test_what_stays_open_is_counted_and_said() -> None:
     first, *others = cameras()
     cut = replace(first, cx=first.cx - 60)  # shows half of the hole
     seen = [View(c, render_bytes(scene(), c)) for c in (cut, *others)]
-    done = remove_object(scene(), seen, REGION, RemovalSettings(extra_references=0), reference=cut.id)
+    done = remove_object(scene(), seen, REGION, RemovalSettings(charts=None, extra_references=0), reference=cut.id)
     assert done.open_pixels > 0.1 * done.hole_pixels
     assert any(f"({done.open_pixels})" in w and "stay open" in w for w in done.warnings)
 
@@ -33,9 +33,9 @@ def test_a_negligible_hole_that_no_view_can_fill_does_not_stop_a_removal(monkeyp
 
     monkeypatch.setattr(pipeline, "choose_reference", none)
     with pytest.raises(IllPosed, match="no view shows it"):
-        remove_object(scene(), views(), REGION)
+        remove_object(scene(), views(), REGION, RemovalSettings(charts=None))
     monkeypatch.setattr(pipeline, "NEGLIGIBLE", 1.0)
-    done = remove_object(scene(), views(), REGION)
+    done = remove_object(scene(), views(), REGION, RemovalSettings(charts=None))
     assert done.added is None and not done.keep.all() and done.open_pixels == done.hole_pixels > 0
     assert any("no view shows it" in w for w in done.warnings) and any("stay open" in w for w in done.warnings)
 

@@ -132,11 +132,11 @@ def test_gathered_views_look_at_the_region_from_one_side(degrees: float) -> None
 
 
 def test_only_completed_surfaces_are_off_inside() -> None:
-    before = pipeline.complete_depth
+    before = pipeline._complete_depth
     with pytest.raises(RuntimeError), noisy_surfaces(0.1, 0):
-        assert pipeline.complete_depth is not before
+        assert pipeline._complete_depth is not before
         raise RuntimeError
-    assert pipeline.complete_depth is before
+    assert pipeline._complete_depth is before
 
 
 def test_table_and_chart_show_what_was_refused() -> None:

@@ -22,6 +22,10 @@ from .mosaic import mosaic
 from .outline import surface_points, window_round
 from .witness import Says, Textures, Witness, ask, meet_range, pack
 
+VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
+SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
+TELLING = 100  # texels that tell how depths scatter
+CHART = "chart"  # split of their cameras
 PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
 UNLIKE = 3.0  # times what photos usually differ by, from which they show different things
 LEAST_SPREAD = 6.0  # grey levels that photos may always differ by
@@ -38,7 +42,7 @@ class ChartSettings:
     hidden: float = 0.15  # share of the views by which the object hides a point of surface that tells of what it hid
     inlier: float = 0.03  # distance up to which such a point lies on a plane
     least: float = 0.1  # share of the points that a plane must hold
-    most: int = 3  # a floor and two walls
+    most: int = 4  # planes that are tried: a floor, two walls, and one that rough depths make up
     search: float = 0.12  # how far photos may move a plane along its normal
     precise: float = 1e-4  # to what it is settled
     rival: float = 1.1  # how much better photos must agree on a plane of its own than on a better one, for its points
@@ -165,7 +169,7 @@ def find_planes(
     cameras = np.array([v.camera.centre for v in views])
     rng, left = np.random.default_rng(0), around
     found: list[tuple[float, Plane, _Round]] = []
-    while len(found) <= settings.most:
+    while len(found) < settings.most:
         candidate = _largest_plane(left.points, left.weight, settings.inlier * diagonal, rng)
         if candidate is None or left.weight[candidate[2]].sum() < settings.least * around.weight.sum():
             break
@@ -194,7 +198,8 @@ def draw_charts(
     textures = Textures.make(witnesses)
     charts: list[Chart] = []
     for plane in planes:
-        chart = _chart(plane, extent(region), views, witnesses, textures, settings)
+        others = [p for p in planes if abs(p.normal @ plane.normal) <= PARALLEL]
+        chart = _chart(plane, others, extent(region), views, witnesses, textures, settings)
         if chart is not None:
             charts.append(chart)
     bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
@@ -288,6 +293,7 @@ def _settled(plane: Plane, half: float, textures: Textures, settings: ChartSetti
 
 def _chart(
     plane: Plane,
+    others: Sequence[Plane],  # that it may meet
     diagonal: float,
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
@@ -326,7 +332,7 @@ def _chart(
     eye = places[0] + away * plane.normal
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, "chart")
+    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART)
     depth = np.full((height, width), away, np.float32)
     kind, noise = "plane", np.nan
     surface = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)).reshape(-1, 3)
@@ -347,10 +353,13 @@ def _chart(
             kind, (depth, surface, agreement) = "relief", as_relief
         else:
             # splats are drawn a little behind the surface that they show: new ones must lie where they do
-            sunk = moved(float(np.median(drawn.offset[drawn.known])))
+            near = drawn.offset[drawn.known & (np.abs(drawn.offset) < SINKS * diagonal)]
+            sunk = moved(float(np.median(near)) if len(near) > TELLING else 0.0)
             if sunk[2] >= settings.sunk * agreement:
                 depth, surface, agreement = sunk
-    tolerance = _tolerance(surface, witnesses, settings)
+    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
+    # what lies behind a wall says nothing of how the floor's depths scatter
+    tolerance = _tolerance(surface[before] if before.sum() > TELLING else surface, witnesses, settings)
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
     hole &= there
@@ -405,8 +414,9 @@ def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: Char
 
 def _unseen(said: np.ndarray, settings: ChartSettings) -> np.ndarray:
     """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
-    seen, hidden, behind, through = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN, Says.BEHIND, Says.THROUGH))
-    return (seen + through < settings.witnesses) & (hidden > behind)
+    seen = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).sum(0)
+    hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
+    return (seen < settings.witnesses) & (hidden > behind)
 
 
 def _there(said: np.ndarray) -> np.ndarray:
@@ -416,8 +426,10 @@ def _there(said: np.ndarray) -> np.ndarray:
     known = seen + through > 0
     if not known.any():
         return np.ones(known.shape, bool)
+    # single texels beside the object's foot err; edges of tables are long
+    votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
     rows, cols = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return (seen >= through)[rows, cols]
+    return (np.where(known, votes, 0) >= 0)[rows, cols]
 
 
 @dataclass(frozen=True)

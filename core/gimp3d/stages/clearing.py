@@ -94,7 +94,7 @@ def clear_air(
     haze = near & kept.usable & (share < settings.observed) & (hidden > settings.shown)
     candidates = np.flatnonzero(haze)
     said = ask(witnesses, kept.means[candidates].astype(np.float64), tolerance)
-    vouched = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).any(0)
+    vouched = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     fates = selection.fates.copy()
     fates[np.flatnonzero(stays)[candidates[~vouched]]] = Fate.REMOVED_REVEALED
     return Selection(fates)
@@ -115,7 +115,7 @@ def chart_targets(
     witnesses: Sequence[Witness],
     charts: Sequence[Chart],
     tolerance: float,
-    extra: Sequence[np.ndarray | None],  # [H, W] bool each: to be filled too
+    marked: Sequence[np.ndarray],  # [H, W] bool each: to be filled too
     settings: ClearingSettings = ClearingSettings(),
 ) -> Targets:
     """T of every view: rays that meet a chart's hole, or a chart where the emptied scene has no surface.
@@ -146,15 +146,10 @@ def chart_targets(
         target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
         target &= met & ~before & (hidden | touched) & ~view.occluder
-        silhouette, before_ = hidden | witnesses[k].beside, view.depth_before
-        mark = extra[k]
-        if mark is not None:
-            silhouette, target, before_ = silhouette | mark, target | mark, np.where(mark, 0, view.depth_before)
         return replace(
             view,
-            silhouette=silhouette,
-            target=target,
-            depth_before=before_,
+            silhouette=hidden | witnesses[k].beside,
+            target=target | marked[k],
             depth_after=depth_after,
             alpha_after=alpha_after,
         ), hits

@@ -58,6 +58,7 @@ def seed_gaussians(
     target: np.ndarray,  # [H, W] bool, T_0
     surfels: bool,
     settings: SeedSettings = SeedSettings(),
+    nearer: bool = False,  # views may look from nearer, as at a chart
 ) -> Gaussians:
     """Gaussians of SH degree 0 that tile the target: large ones where colour and surface are smooth.
 
@@ -89,8 +90,9 @@ def seed_gaussians(
     slopes = normal @ steps.T / towards[:, None]
     tangents = z[..., None] * (steps[None] - slopes[..., None] * rays[:, None])  # [N, 2, 3]
     tangents -= (tangents @ normal[..., None]) * normal[:, None]
-    # The rasteriser widens 3D Gaussians by its low-pass, in pixels; surfels are drawn as they are.
-    low_pass = 0.0 if surfels else RasterSettings().low_pass
+    # The rasteriser widens 3D Gaussians by its low-pass, in pixels; surfels are drawn as they are. Seen from nearer,
+    # that is less than here, and cracks would open.
+    low_pass = 0.0 if surfels or nearer else RasterSettings().low_pass
     sides = np.stack([width, height], -1)[..., None]
     sigma = np.sqrt(np.maximum((settings.spread * sides) ** 2 - low_pass, LEAST_SIGMA**2))
     axes, scales, _ = np.linalg.svd(np.swapaxes(sigma * tangents, 1, 2), full_matrices=False)

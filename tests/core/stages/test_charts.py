@@ -1,0 +1,335 @@
+"""Charts of a floor and a wall that a box hides, and where rays meet them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from scenes import REGION, cameras
+
+from gimp3d.box import Box
+from gimp3d.camera import Camera
+from gimp3d.orbit import look_at
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find_planes, first_hits
+from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.witness import Says, Witness, ask
+
+FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset
+WALL = (np.array([0.0, -1, 0]), -0.4)
+SLANT = (np.array([-0.12, 0.05, 1]) / np.linalg.norm([-0.12, 0.05, 1]), 0.02)
+BLOCK = (np.array([-0.25, -0.25, 0]), np.array([0.25, 0.25, 0.5]))
+UP = np.array([0.0, 0, 1])
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    x, y, z = np.moveaxis(points, -1, 0)
+    waves = [np.sin(9 * x + 4 * y + 8 * z), np.sin(11 * y - 5 * x + 3 * z), np.sin(7 * x - 8 * y - 10 * z)]
+    return np.stack([120 + 50 * w + 20 * waves[0] * waves[1] for w in waves], -1)
+
+
+def plane_reach(origin: np.ndarray, rays: np.ndarray, plane: tuple[np.ndarray, float]) -> np.ndarray:
+    """How many rays' lengths away a plane is met; infinite where it is not."""
+    normal, offset = plane
+    with np.errstate(divide="ignore"):
+        reach = (offset - origin @ normal) / (rays @ normal)
+    return np.where(reach > 0, reach, np.inf)
+
+
+def block_reach(origin: np.ndarray, rays: np.ndarray, grow: float = 0.0) -> np.ndarray:
+    """The same for the block, grown by so much on every side."""
+    with np.errstate(divide="ignore"):
+        a, b = (BLOCK[0] - grow - origin) / rays, (BLOCK[1] + grow - origin) / rays
+    near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+    return np.where((near < far) & (near > 0), near, np.inf)
+
+
+@dataclass(frozen=True)
+class Room:
+    """Views of surfaces that the block hides."""
+
+    views: list[ViewMasks]
+    witnesses: list[Witness]
+
+
+def room(eyes: tuple[Camera, ...], planes: list[tuple[np.ndarray, float]], noise: float = 0.0) -> Room:
+    """Photos and depth maps, the latter with relative noise."""
+    rng = np.random.default_rng(5)
+    views, witnesses = [], []
+    for camera in eyes:
+        shape = (camera.height, camera.width)
+        rays = camera.unproject(camera.pixel_centres(), np.ones(shape)) - camera.centre
+        surface = np.min([plane_reach(camera.centre, rays, p) for p in planes], axis=0)
+        front = block_reach(camera.centre, rays)
+        z = np.minimum(surface, front)
+        shown = np.isfinite(z)
+        z = np.where(shown, z, 0)
+        photo = np.clip(np.rint(texture(camera.centre + z[..., None] * rays)), 0, 255)
+        photo = np.where((front < surface)[..., None], [200, 20, 20], photo * shown[..., None]).astype(np.uint8)
+        object_ = (front < surface).astype(np.uint8)
+        hidden, some = (cv2.dilate(object_, np.ones((n, n), np.uint8)) > 0 for n in (3, 7))
+        depth = (z * (1 + noise * rng.normal(size=shape))).astype(np.float32)
+        alpha, no = shown.astype(np.float32), np.zeros(shape, bool)
+        views.append(ViewMasks(camera, hidden, hidden, no, no, depth, alpha, depth, alpha))
+        witnesses.append(Witness(camera, photo, hidden, some & ~hidden, depth))
+    return Room(views, witnesses)
+
+
+def hidden_everywhere(eyes: tuple[Camera, ...], points: np.ndarray, grow: float) -> np.ndarray:
+    """[N] bool: the block, grown, lies between the point and every camera that frames it, and one does."""
+    always, framed = np.ones(len(points), bool), np.zeros(len(points), bool)
+    for camera in eyes:
+        uv, _ = camera.project(points)
+        inside = ((uv >= 0) & (uv < [camera.width, camera.height])).all(1)
+        framed |= inside
+        always &= ~inside | (block_reach(camera.centre, points - camera.centre, grow) < 1)
+    return always & framed
+
+
+def unseen(chart: Chart, witnesses: list[Witness]) -> np.ndarray:
+    """[H, W] bool: what the photos leave open of a chart."""
+    surface = chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(float)).reshape(-1, 3)
+    said = ask(witnesses, surface, chart.tolerance).reshape(-1, *chart.depth.shape)
+    count = {s: (said == s).sum(0) for s in Says}
+    shown = count[Says.SEEN] + count[Says.BESIDE] + count[Says.THROUGH]
+    return (shown == 0) & (count[Says.HIDDEN] > count[Says.BEHIND])
+
+
+def texels(chart: Chart) -> np.ndarray:
+    """[H·W, 3] scene coordinates."""
+    return chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(float)).reshape(-1, 3)
+
+
+def front_cameras(heights: tuple[float, float, float]) -> tuple[Camera, ...]:
+    """Views from the room's side of the wall."""
+    found = []
+    for k in range(9):
+        angle = np.radians(-90 + 12 * (k - 4))
+        eye = np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), heights[k % 3]])
+        found.append(Camera(str(k), 240, 180, 230.0, 230.0, 120.0, 90.0, look_at(eye, np.array([0, 0, 0.25]), UP)))
+    return tuple(found)
+
+
+EYES = cameras(9, 240, 180)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Room:
+    return room(EYES, [SLANT], noise=0.01)
+
+
+@pytest.fixture(scope="module")
+def floor_room() -> Room:
+    return room(EYES, [FLOOR])
+
+
+@pytest.fixture(scope="module")
+def floor_chart(floor_room: Room) -> Chart:
+    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, floor_room.witnesses, REGION)
+    return chart
+
+
+def test_a_plane_is_found_where_photos_have_it_though_depths_are_noisy(noisy: Room) -> None:
+    (plane,) = find_planes(noisy.views, noisy.witnesses, REGION)
+    normal, offset = SLANT
+    assert np.degrees(np.arccos(plane.normal @ normal)) < 0.3
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
+    assert np.abs(plane.points(x, y) @ normal - offset).max() < 0.003
+    (chart,) = draw_charts([plane], noisy.views, noisy.witnesses, REGION)
+    assert chart.kind == "plane"
+
+
+def test_depths_that_are_all_wrong_alike_do_not_move_the_plane(floor_room: Room) -> None:
+    """Rough splats lie behind the surface that they show."""
+    sunk = [replace(v, depth_before=v.depth_before * np.float32(1.02)) for v in floor_room.views]
+    witnesses = [replace(w, depth=w.depth * np.float32(1.02)) for w in floor_room.witnesses]
+    planes = find_planes(sunk, witnesses, REGION)
+    assert planes[0].normal @ UP > np.cos(np.radians(0.3))
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
+    assert np.abs(planes[0].points(x, y)[..., 2]).max() < 0.003
+
+
+def test_a_plane_s_axes_are_orthonormal_and_its_coordinates_come_back() -> None:
+    plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION).tilted(0.1, 0.2, -0.1)
+    axes = np.stack([plane.right, plane.down, plane.normal])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    x, y, height = np.random.default_rng(1).normal(size=(3, 20))
+    np.testing.assert_allclose(plane.local(plane.points(x, y, height)), np.stack([x, y, height], -1), atol=1e-12)
+
+
+def test_tilting_raises_the_plane_by_its_slopes() -> None:
+    plane = Plane.make(np.zeros(3), UP, REGION)
+    tilted = plane.tilted(0.1, 0.2, -0.3)
+    x, y = np.random.default_rng(2).normal(size=(2, 20))
+    np.testing.assert_allclose(tilted.local(plane.points(x, y, 0.1 + 0.2 * x - 0.3 * y))[:, 2], 0, atol=1e-12)
+
+
+def test_the_hole_is_what_no_photo_shows(floor_room: Room, floor_chart: Chart) -> None:
+    np.testing.assert_array_equal(floor_chart.hole, unseen(floor_chart, floor_room.witnesses))
+    hole, points = floor_chart.hole.ravel(), texels(floor_chart)
+    np.testing.assert_allclose(points[:, 2], 0, atol=1e-5)
+    certain = hidden_everywhere(EYES, points, 0.0)
+    possible = hidden_everywhere(EYES, points, 0.06)  # 2 px of the farthest view, aslant
+    assert certain.sum() > 500 and not possible.all()
+    assert hole[certain].all() and not hole[~possible].any()
+
+
+def test_a_chart_shows_the_floor_and_nothing_in_its_hole(floor_room: Room, floor_chart: Chart) -> None:
+    c = floor_chart
+    assert c.kind == "plane" and c.there.all() and c.agreement > 0.9 and c.noise < 1e-5
+    assert np.abs(c.image[c.photos > 0] - texture(texels(c)).reshape(c.image.shape)[c.photos > 0]).max() < 4
+    assert not (c.known & c.hole).any() and not (c.beside & (c.photos > 0)).any()
+    said = ask(floor_room.witnesses, texels(c), c.tolerance).reshape(-1, *c.depth.shape)
+    np.testing.assert_array_equal(c.photos, (said == Says.SEEN).sum(0))
+    shown = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
+    assert (c.hole & ~shown).sum() > 500 and not c.image[~shown].any()
+    assert c.camera.id == "chart:1" and c.camera.forward @ UP == pytest.approx(-1)
+
+
+def test_a_surface_that_nothing_hides_has_no_chart(floor_room: Room) -> None:
+    clear = [replace(w, hidden=np.zeros_like(w.hidden)) for w in floor_room.witnesses]
+    assert draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, clear, REGION) == ()
+
+
+def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:
+    plane = Plane.make(np.zeros(3), UP, REGION)
+    small = draw_charts([plane], floor_room.views, floor_room.witnesses, REGION, ChartSettings(largest=50))[0]
+    assert max(small.camera.width, small.camera.height) in (50, 51)
+    area = [c.hole.sum() * (c.camera.fx / c.depth[0, 0]) ** -2 for c in (small, floor_chart)]
+    assert area[0] == pytest.approx(area[1], rel=0.05)
+
+
+LOW, HIGH = (0.7, 1.2, 1.9), (1.6, 2.2, 2.8)
+
+
+@pytest.mark.parametrize(
+    ("which", "heights"),
+    [
+        pytest.param(0, HIGH, id="floor-high"),
+        pytest.param(1, LOW, id="wall-low"),
+        pytest.param(0, LOW, id="floor-low"),
+        pytest.param(1, HIGH, id="wall-high"),
+    ],
+)
+def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: tuple[float, float, float]) -> None:
+    eyes = front_cameras(heights)
+    seen = room(eyes, [FLOOR, WALL])
+    planes = [Plane.make(np.zeros(3), UP, REGION), Plane.make(np.array([0, 0.4, 0]), WALL[0], REGION)]
+    chart = draw_charts(planes, seen.views, seen.witnesses, REGION)[which]
+    (alone,) = draw_charts(planes[which : which + 1], seen.views, seen.witnesses, REGION)
+    points, there, hole = texels(chart), chart.there.ravel(), chart.hole.ravel()
+    behind = (points[:, 1] - 0.4, -points[:, 2])[which]  # how far behind the other surface
+    assert alone.there.ravel()[behind > 0.01].any()  # the other chart, not the photos, ends this one
+    assert not there[behind > 1e-4].any() and not (hole & ~there).any()
+    assert there[behind < -1e-4].all()
+    certain = hidden_everywhere(eyes, points, 0.0) & there
+    assert certain.sum() > 100 and hole[certain].all()
+    assert not hole[~hidden_everywhere(eyes, points, 0.06)].any()
+
+
+def test_parallel_surfaces_do_not_end_each_other(floor_room: Room, floor_chart: Chart) -> None:
+    planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, 0.005)]
+    first = draw_charts(planes, floor_room.views, floor_room.witnesses, REGION)[0]
+    np.testing.assert_array_equal(first.there, floor_chart.there)
+
+
+def test_the_extent_of_several_boxes_holds_them_all() -> None:
+    one, two = Box.make([0, 0, 0], [1, 2, 2]), Box.make([10, 0, 0], [1, 1, 1])
+    assert extent((one,)) == pytest.approx(3)
+    assert extent((one, two)) == pytest.approx(np.linalg.norm([11, 2, 2]))
+
+
+def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float = 5.0, texel: float = 0.01) -> Chart:
+    """A chart of a height field over the plane normal · p = offset, from `away` above the place nearest to 0."""
+    h, w = depth.shape
+    eye = (offset + away) * normal
+    pose = look_at(eye, eye - normal, np.array([0.0, 1, 0]))
+    camera = Camera("chart", w, h, away / texel, away / texel, w / 2, h / 2, pose)
+    no, grey = np.zeros((h, w), bool), np.zeros((h, w, 3), np.uint8)
+    axes = pose[:3, :3]
+    plane = Plane(offset * normal, axes[0], axes[1], normal)
+    there = np.ones((h, w), bool)
+    return Chart(camera, plane, "plane", depth, there, grey, no.astype(np.uint16), no, no, no, 1.0, 0.0, 0.01, "")
+
+
+def rays_of(camera: Camera) -> np.ndarray:
+    return camera.unproject(camera.pixel_centres(), np.ones((camera.height, camera.width))) - camera.centre
+
+
+@pytest.mark.parametrize("camera", EYES[:3])
+def test_rays_meet_a_tilted_plane_where_they_should(camera: Camera) -> None:
+    chart = chart_of(np.full((80, 100), 5, np.float32), *SLANT)
+    asked = np.random.default_rng(3).random((180, 240)) < 0.7
+    hits = first_hits([chart], camera, asked)
+    reach = plane_reach(camera.centre, rays_of(camera), SLANT)
+    uv, _ = chart.camera.project(camera.centre + np.where(np.isfinite(reach), reach, 0)[..., None] * rays_of(camera))
+    off = np.abs(uv - [50, 40]) - [50, 40]
+    inside, outside = asked & (off < -1e-3).all(-1), ~asked | (off > 1e-3).any(-1)
+    assert inside.sum() > 900
+    np.testing.assert_allclose(hits.depth[inside], reach[inside], rtol=1e-6)
+    assert (hits.chart[inside] == 0).all() and (hits.chart[outside] == -1).all() and not hits.depth[outside].any()
+    clear = inside & (np.abs(uv - np.rint(uv)) > 1e-3).all(-1)
+    np.testing.assert_array_equal(hits.cols[clear], uv[clear][:, 0].astype(int))
+    np.testing.assert_array_equal(hits.rows[clear], uv[clear][:, 1].astype(int))
+
+
+@pytest.mark.parametrize("camera", EYES[:3])
+def test_rays_meet_a_relief_where_they_should(camera: Camera) -> None:
+    """Waves of ±2 cm, against bisection of the ray between what is certainly above and below them."""
+    low, wave = 0.02, 2 * np.pi / 0.8
+
+    def z_at(uv: np.ndarray) -> np.ndarray:
+        return 5 - low * np.sin(wave * (uv[..., 0] - 100) * 0.01) * np.cos(wave * (uv[..., 1] - 80) * 0.01)
+
+    flat = chart_of(np.full((160, 200), 5, np.float32), *FLOOR)
+    chart = replace(flat, depth=z_at(flat.camera.pixel_centres()).astype(np.float32))
+    hits = first_hits([chart], camera, np.ones((180, 240), bool))
+    rays = rays_of(camera)
+    above, below = (plane_reach(camera.centre, rays, (UP, h)) for h in (0.025, -0.025))
+    framed = np.isfinite(below)
+    for reach in (above, below):
+        uv, _ = chart.camera.project(camera.centre + np.where(framed, reach, 0)[..., None] * rays)
+        framed &= ((uv > 0) & (uv < [200, 160])).all(-1)
+    above, below, rays = above[framed], below[framed], rays[framed]
+    for _ in range(40):
+        middle = (above + below) / 2
+        uv, z = chart.camera.project(camera.centre + middle[:, None] * rays)
+        over = z < z_at(uv)
+        above, below = np.where(over, middle, above), np.where(over, below, middle)
+    assert framed.sum() > 2000 and (hits.chart[framed] == 0).all()
+    heights = (camera.centre + hits.depth[framed][:, None] * rays)[:, 2] - (camera.centre + above[:, None] * rays)[:, 2]
+    grazing = (-rays[:, 2] / np.linalg.norm(rays[:, :2], axis=1)).min()
+    assert np.abs(heights).max() < 0.01 * low * wave / (1 - low * wave / grazing)  # the rise over a texel of the ray
+    plain = (camera.centre + plane_reach(camera.centre, rays, FLOOR)[:, None] * rays)[:, 2]
+    assert np.abs(plain - (camera.centre + above[:, None] * rays)[:, 2]).max() > 0.015  # unlike the plane
+
+
+def test_the_nearer_of_two_charts_is_met_and_the_other_where_it_is_not() -> None:
+    flat = np.full((120, 120), 5, np.float32)
+    low, high = chart_of(flat, *FLOOR), chart_of(flat, UP, 0.1)
+    gap = np.ones((120, 120), bool)
+    gap[40:80, 40:80] = False
+    high = replace(high, there=gap)
+    camera = EYES[2]
+    rays, everything = rays_of(camera), np.ones((180, 240), bool)
+    hits = [first_hits(c, camera, everything) for c in ([low, high], [high, low])]
+    reach = plane_reach(camera.centre, rays, (UP, 0.1))
+    upper, _ = high.camera.project(camera.centre + reach[..., None] * rays)
+    through = ((upper > 40.01) & (upper < 79.99)).all(-1)
+    off = np.abs(upper - 60).max(-1)
+    on = (off < 59.9) & (off > 20.01)
+    assert through.sum() > 100 and on.sum() > 1000
+    assert (hits[0].chart[on] == 1).all() and (hits[0].chart[through] == 0).all()
+    np.testing.assert_allclose(hits[0].depth[on], reach[on], rtol=1e-6)
+    np.testing.assert_allclose(hits[0].depth[through], plane_reach(camera.centre, rays, FLOOR)[through], rtol=1e-6)
+    np.testing.assert_array_equal(hits[0].depth, hits[1].depth)
+    np.testing.assert_array_equal(hits[0].rows, hits[1].rows)
+
+
+def test_a_chart_is_not_met_from_below_nor_behind_the_camera() -> None:
+    chart = chart_of(np.full((80, 100), 5, np.float32), *FLOOR)
+    everything = np.ones((180, 240), bool)
+    for eye, target in (([0.1, 0, -2], [0, 0, 0]), ([0.1, 0, 2], [0, 0, 4])):
+        camera = replace(EYES[0], viewmat=look_at(np.array(eye, float), np.array(target, float), np.array([0.0, 1, 0])))
+        assert (first_hits([chart], camera, everything).chart == -1).all()

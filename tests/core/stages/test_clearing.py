@@ -1,0 +1,238 @@
+"""What the removal leaves in the air goes, and targets are the charts' holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from scenes import BLOCK, REGION, cameras, discs, floor, scene
+
+from gimp3d.gaussians import Gaussians
+from gimp3d.raster import footprint, surface_depth
+from gimp3d.stages.charts import Chart, Plane, draw_charts
+from gimp3d.stages.clearing import (
+    ClearingSettings,
+    Targets,
+    chart_targets,
+    clear_air,
+    object_pixels,
+    observed_share,
+)
+from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.selection import Fate, Selection
+from gimp3d.stages.witness import Says, Witness, ask
+
+UP = np.array([0.0, 0, 1])
+EYES = cameras(9, 160, 120)
+TOLERANCE = 0.02
+NONE = np.zeros((120, 160), bool)  # no marks
+
+
+@dataclass(frozen=True)
+class Removal:
+    """A scene whose block is to go, as its views show it."""
+
+    scene: Gaussians
+    selection: Selection
+    views: list[ViewMasks]
+    witnesses: list[Witness]
+
+
+def removal(extra: Gaussians | None = None) -> Removal:
+    """The block scene and further Gaussians, which stay."""
+    whole = scene()
+    object_ = np.arange(len(whole)) >= len(floor(with_hole=True))
+    fates = np.where(object_, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8)
+    if extra is not None:
+        whole = whole.extended(extra)
+        fates = np.concatenate([fates, np.full(len(extra), Fate.OUTSIDE, np.uint8)])
+    views = []
+    for camera in EYES:
+        depth, alpha = surface_depth(whole, camera)
+        no = np.zeros(depth.shape, bool)
+        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha))
+    selection = Selection(fates)
+    masks = object_pixels(whole, selection.removed, views, ClearingSettings())
+    witnesses = [
+        Witness(v.camera, np.full((*v.depth_before.shape, 3), 99, np.uint8), shown, some, v.depth_before)
+        for v, (shown, some) in zip(views, masks)
+    ]
+    return Removal(whole, selection, views, witnesses)
+
+
+def specks(places: list[list[float]]) -> Gaussians:
+    return discs(np.array(places), (0, 0, 1), np.full((len(places), 3), 0.5), 0.05)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Removal:
+    return removal()
+
+
+@pytest.fixture(scope="module")
+def charts(plain: Removal) -> tuple[Chart, ...]:
+    return draw_charts([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses, REGION)
+
+
+@pytest.fixture(scope="module")
+def targets(plain: Removal, charts: tuple[Chart, ...]) -> Targets:
+    p = plain
+    return chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
+
+
+def cleared(removal: Removal, witnesses: list[Witness] | None = None) -> np.ndarray:
+    """Rows that clear_air removes on top of the selection's."""
+    told = removal.witnesses if witnesses is None else witnesses
+    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, TOLERANCE)
+    new = after.removed & ~removal.selection.removed
+    assert (after.fates[new] == Fate.REMOVED_REVEALED).all()
+    np.testing.assert_array_equal(after.fates[~new], removal.selection.fates[~new])
+    return np.flatnonzero(new)
+
+
+def test_photos_show_the_object_where_its_gaussians_draw(plain: Removal) -> None:
+    for view, witness in zip(plain.views, plain.witnesses):
+        weight = footprint(plain.scene, view.camera, plain.selection.removed)
+        assert witness.hidden[weight > 0.5].mean() > 0.99
+        assert (witness.beside | ~witness.hidden).all()  # some of it is where it is
+        near = np.zeros_like(weight, bool)
+        rows, cols = np.nonzero(weight > 0.1)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                near[np.clip(rows + dy, 0, 119), np.clip(cols + dx, 0, 159)] = True
+        assert not (witness.hidden | witness.beside)[~near].any()
+
+
+def test_haze_within_the_object_goes_and_what_photos_see_stays() -> None:
+    given = removal(specks([[0, 0, 0.25], [0.1, -0.1, 0.3], [0.5, 0.45, 0.3], [0, 0, 0.75]]))
+    new = cleared(given)
+    first = len(given.scene) - 4
+    assert {first, first + 1} <= set(new) and not {first + 2, first + 3} & set(new)
+    inside = np.abs(given.scene.means[new]).max(1) < BLOCK
+    assert inside.all()  # nothing but what the block hid
+
+
+def test_the_floor_round_the_object_stays(plain: Removal) -> None:
+    gone = plain.scene.means[cleared(plain)]
+    assert (np.abs(gone[:, :2]) < BLOCK / 2 + 0.06).all()
+
+
+def test_what_one_photo_sees_in_its_place_stays() -> None:
+    """Although the object hides it in all the others."""
+    given = removal(specks([[0.36, 0.1, 0.3]]))
+    row = len(given.scene) - 1
+    blind = [replace(w, hidden=np.ones_like(w.hidden)) for w in given.witnesses]
+    assert row in cleared(given, blind)
+    told = ask(given.witnesses, given.scene.means[row:].astype(np.float64), TOLERANCE)[:, 0]
+    assert {Says.SEEN, Says.HIDDEN} <= set(told)
+    for k, witness in enumerate(given.witnesses):
+        if told[k] in (Says.SEEN, Says.HIDDEN):
+            new = cleared(given, [*blind[:k], witness, *blind[k + 1 :]])
+            assert (row in new) == (told[k] == Says.HIDDEN)
+
+
+def test_far_haze_and_haze_that_draws_nothing_stay() -> None:
+    faint = replace(specks([[0, 0, 0.25]]), opacity_logits=np.full(1, -12, np.float32))
+    given = removal(specks([[1.4, 0, 0.2]]).extended(faint))
+    blind = [replace(w, hidden=np.ones_like(w.hidden)) for w in given.witnesses]
+    new = set(cleared(given, blind))
+    assert not {len(given.scene) - 2, len(given.scene) - 1} & new and new
+
+
+def test_shares_are_those_of_the_blend_weights() -> None:
+    given = removal(specks([[0, 0, 0.25], [0.5, 0.45, 0.3]]))
+    stays = ~given.selection.removed
+    kept = given.scene.take(stays)
+    rows = np.zeros(len(kept), bool)
+    rows[-2:] = True
+    share, hidden = observed_share(kept, rows, given.views, given.witnesses)
+    assert (share[~rows] == 1).all() and (hidden[~rows] == 0).all()
+    for row in (-2, -1):
+        chosen = np.zeros(len(kept), bool)
+        chosen[row] = True
+        weights = [footprint(kept, v.camera, chosen) for v in given.views]
+        behind = sum(float(w[t.hidden].sum()) for w, t in zip(weights, given.witnesses))
+        total = sum(float(w.sum()) for w in weights)
+        assert hidden[row] == pytest.approx(behind, rel=1e-3)
+        assert share[row] == pytest.approx(1 - behind / total, abs=1e-3)
+    assert share[-2] < 0.1 < 0.9 < share[-1]
+
+
+def test_targets_lie_where_the_object_was_and_meet_a_chart(plain: Removal, targets: Targets) -> None:
+    assert len(targets.views) == len(targets.hits) == len(EYES)
+    for view, hits, witness in zip(targets.views, targets.hits, plain.witnesses):
+        touched = footprint(plain.scene, view.camera, plain.selection.removed) > 0.05
+        assert view.target.any()
+        assert not (view.target & ~(witness.hidden | touched)).any()
+        assert not (view.target & (hits.depth == 0)).any()
+        np.testing.assert_array_equal(view.silhouette, witness.hidden | witness.beside)
+
+
+def test_targets_are_the_floor_s_hole_below_the_block(plain: Removal, targets: Targets) -> None:
+    for view, witness in zip(targets.views, plain.witnesses):
+        camera = view.camera
+        rays = camera.unproject(camera.pixel_centres(), np.ones(view.target.shape)) - camera.centre
+        with np.errstate(divide="ignore"):
+            z = -camera.centre[2] / rays[..., 2]
+        place = np.abs(camera.centre + np.where(z > 0, z, 1e6)[..., None] * rays)[..., :2].max(-1)
+        assert (place < BLOCK / 2 - 0.06).sum() > 50
+        assert view.target[(place < BLOCK / 2 - 0.06) & witness.hidden].all()
+        far = cv2.distanceTransform((place > BLOCK / 2 + 0.06).astype(np.uint8), cv2.DIST_L2, 5)
+        assert far[view.target].max() < 2.5  # closed and grown by a pixel each
+
+
+def test_targets_hold_the_charts_holes(plain: Removal, charts: tuple[Chart, ...], targets: Targets) -> None:
+    for view, hits, witness in zip(targets.views, targets.hits, plain.witnesses):
+        met = hits.chart == 0
+        hole = np.zeros(met.shape, bool)
+        hole[met] = charts[0].hole[hits.rows[met], hits.cols[met]]
+        before = (view.alpha_after >= 0.5) & (view.depth_after > 0)
+        before &= view.depth_after < (1 - TOLERANCE) * hits.depth
+        assert view.target[hole & witness.hidden & ~before].all()
+        assert not (view.target & before).any()
+
+
+def test_what_stays_before_the_floor_is_not_filled(charts: tuple[Chart, ...], targets: Targets) -> None:
+    """A board within the block that other photos saw, and pixels of a surface in front of the block."""
+    given = removal(discs(np.array([[0, 0, 0.3]]), (0, 0, 1), np.full((1, 3), 0.5), 0.09))
+    views = list(given.views)
+    bar = np.zeros((120, 160), bool)
+    bar[:, 70:75] = True
+    views[3] = replace(views[3], occluder=bar)
+    found = chart_targets(given.scene, given.selection, views, given.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
+    board = np.arange(len(given.scene)) == len(given.scene) - 1
+    kept = given.scene.take(~given.selection.removed)
+    lost = 0
+    for view, plain_view in zip(found.views, targets.views):
+        solid = footprint(kept, view.camera, board[~given.selection.removed]) > 0.8
+        assert solid.any() and not (view.target & solid).any()
+        lost += int((plain_view.target & solid).sum())
+    assert lost > 50
+    assert (targets.views[3].target & bar).any() and not (found.views[3].target & bar).any()
+
+
+def test_marked_pixels_are_filled_too(plain: Removal, charts: tuple[Chart, ...], targets: Targets) -> None:
+    mark = np.zeros((120, 160), bool)
+    mark[5:15, 8:30] = True
+    marks = [mark if k == 2 else NONE for k in range(len(EYES))]
+    p = plain
+    found = chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, TOLERANCE, marks)
+    for k, (view, without) in enumerate(zip(found.views, targets.views)):
+        np.testing.assert_array_equal(view.target, without.target | mark if k == 2 else without.target)
+
+
+def test_views_after_are_those_of_the_emptied_scene(plain: Removal, targets: Targets) -> None:
+    kept = plain.scene.take(~plain.selection.removed)
+    for view in targets.views:
+        depth, alpha = surface_depth(kept, view.camera)
+        np.testing.assert_allclose(view.alpha_after, alpha, atol=1e-5)
+        both = (depth > 0) & (view.depth_after > 0)
+        np.testing.assert_allclose(view.depth_after[both], depth[both], rtol=1e-5)
+
+
+def test_without_charts_there_are_no_targets(plain: Removal) -> None:
+    p = plain
+    found = chart_targets(p.scene, p.selection, p.views, p.witnesses, (), TOLERANCE, [NONE] * len(EYES))
+    assert not any(v.target.any() for v in found.views) and not any(h.depth.any() for h in found.hits)
