@@ -409,7 +409,7 @@ def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: Char
         off.append(front[shown] / z[framed][shown] - 1)
     all_ = np.abs(np.concatenate(off)) if off else np.zeros(0)
     spread = 3 * 1.4826 * float(np.median(all_)) if len(all_) else 0.0
-    return float(np.clip(spread, 0.3 * settings.tolerance, 4 * settings.tolerance))
+    return float(np.clip(spread, settings.tolerance, 4 * settings.tolerance))
 
 
 def _unseen(said: np.ndarray, settings: ChartSettings) -> np.ndarray:
