@@ -27,9 +27,8 @@ SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
 TELLING = 100  # texels that tell how depths scatter
 CHART = "chart"  # split of their cameras
 PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
-UNLIKE = 3.0  # times what photos usually differ by, from which they show different things
-LEAST_SPREAD = 6.0  # grey levels that photos may always differ by
-LEFTOVER = 6  # px round a hole within which what photos do not agree on is taken for a rest of the object
+UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
+LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 
 
@@ -363,12 +362,12 @@ def _chart(
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
     hole &= there
-    image, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
+    image, common, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
     photos = (said == Says.SEEN).sum(0).astype(np.uint16)
     beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
-    alike = _alike(spread, photos, there & ~hole)
-    grown = cv2.dilate(hole.astype(np.uint8), np.ones((2 * LEFTOVER + 1,) * 2, np.uint8)) > 0
-    hole |= grown & there & (photos > 1) & ~alike
+    alike = _alike(common, spread, there & (photos > 1) & ~hole)
+    # few photos claim to show what the object hides from most, and they do not agree: they show something before it
+    hole |= there & (photos > 0) & ~alike & ((said == Says.HIDDEN).sum(0) > photos)
     return Chart(
         camera,
         plane,
@@ -377,7 +376,7 @@ def _chart(
         there,
         image,
         photos,
-        alike & ~hole,
+        alike & there & (photos > 1) & ~hole,
         beside & ~hole,
         hole,
         agreement,
@@ -387,12 +386,16 @@ def _chart(
     )
 
 
-def _alike(spread: np.ndarray, photos: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[H, W] bool: texels of which photos tell much the same: things that stand on the surface smear over it."""
-    told = known & (photos > 1)
+def _alike(common: np.ndarray, spread: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """[H, W] bool: texels of which photos tell much the same: things that stand on the surface smear over it.
+
+    Misplaced photos differ too where there is texture, but by less than what they have in common; and a quarter of
+    what several photos show is taken for the surface itself.
+    """
     if not told.any():
-        return photos > 0
-    return told & (spread <= max(LEAST_SPREAD, UNLIKE * float(np.median(spread[told]))))
+        return np.ones(told.shape, bool)
+    limit = max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread[told], 25)))
+    return spread <= np.maximum(common, limit)
 
 
 def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:

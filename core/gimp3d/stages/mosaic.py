@@ -10,7 +10,7 @@ import numpy as np
 from ..camera import Camera
 from ..jit import exact_kernel
 from ..threads import parallel_map, run_ranges
-from .witness import Says, Witness
+from .witness import Says, Witness, texture
 
 SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say
 FEW = 12.0  # grey levels by which a photo may always differ from what most say
@@ -22,10 +22,12 @@ def mosaic(
     normal: np.ndarray,  # [3] unit
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
 
-    And by how much photos differ from them, [H, W] float32 grey levels, the median over photos.
+    And what photos' textures have in common round each texel, and by how much they differ from that, [H, W] float32
+    grey levels each, medians over photos: light differs between photos on any surface, but things that do not lie on
+    it also show another texture in each.
 
     Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
     decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time: the one
@@ -37,7 +39,7 @@ def mosaic(
     told = np.where(clear, said == Says.SEEN, said == Says.BESIDE)
     flat = points.reshape(-1, 3)
 
-    def of(k: int) -> tuple[np.ndarray, np.ndarray]:
+    def of(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         c = witnesses[k].camera
         uv, z = c.project(points)
         x, y = (np.nan_to_num(uv, nan=-1e4).astype(np.float32) - 0.5).transpose(2, 0, 1)
@@ -45,28 +47,31 @@ def mosaic(
         towards = c.centre - flat
         cosine = towards @ normal / np.linalg.norm(towards, axis=1)
         density = np.where(told[k].ravel(), np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
-        return sample.reshape(-1, 3), (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
+        density = (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
+        return sample.reshape(-1, 3), texture(sample, told[k]).ravel(), density
 
     parts = parallel_map(of, range(len(witnesses)))
-    samples, density = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
+    samples, textures, density = (np.array([p[k] for p in parts]) for k in range(3))
     common, best = np.zeros((2, h * w, 3), np.float32)
-    spread = np.zeros(h * w, np.float32)
-    run_ranges(_choose_range, h * w, samples, density, FEW, common, best, spread)
+    alike, spread = np.zeros((2, h * w), np.float32)
+    run_ranges(_choose_range, h * w, samples, textures, density, FEW, common, best, alike, spread)
     common, best = common.reshape(h, w, 3), best.reshape(h, w, 3)
     shown = (density > 0).any(0).reshape(h, w)
     detail = best - _smooth(best, shown)
     picture = np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0)
-    return picture.astype(np.uint8), spread.reshape(h, w)
+    several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
+    alike, spread = (_smooth(a.reshape(h, w, 1), several)[..., 0] for a in (alike, spread))
+    return picture.astype(np.uint8), alike, spread
 
 
 def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
     weight = shown.astype(np.float32)
-    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), SEAM)
+    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), SEAM).reshape(picture.shape)
     return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), SEAM), 1e-3)[..., None]
 
 
 @exact_kernel
-def _choose_range(lo, hi, samples, density, few, common, best, spread):
+def _choose_range(lo, hi, samples, textures, density, few, common, best, alike, spread):
     views = len(samples)
     values = np.empty(views)
     for i in range(lo, hi):
@@ -80,10 +85,16 @@ def _choose_range(lo, hi, samples, density, few, common, best, spread):
             if count:
                 part = np.sort(values[:count])
                 common[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
-                part = np.sort(np.abs(part - common[i, channel]))
-                spread[i] += part[count // 2] / 3
         if count == 0:
             continue
+        count = 0
+        for k in range(views):
+            if density[k, i] > 0:
+                values[count] = textures[k, i]
+                count += 1
+        part = np.sort(values[:count])
+        alike[i] = 0.5 * abs(part[count // 2])
+        spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
         off, least, largest = 0.0, 1e9, 0.0
         for k in range(views):  # the nearest to the median always agrees
             if density[k, i] > 0:

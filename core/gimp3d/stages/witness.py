@@ -89,6 +89,20 @@ def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
             said[i] = BESIDE if beside[row, col] else SEEN
 
 
+def texture(
+    photo: np.ndarray,  # [H, W, 3] uint8
+    shown: np.ndarray,  # [H, W] bool, pixels that count
+) -> np.ndarray:
+    """Band-passed luminance, [H, W] int8 in half grey levels: what tells places apart, whatever the light."""
+    grey, weight = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32), shown.astype(np.float32)
+
+    def blurred(sigma: float) -> np.ndarray:
+        total = cv2.GaussianBlur(grey * weight, (0, 0), sigma)
+        return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
+
+    return np.clip(np.rint(2 * (blurred(FINE) - blurred(COARSE))), -LOUD, LOUD).astype(np.int8)
+
+
 @dataclass(frozen=True)
 class Textures:
     """Photos reduced to their texture, for comparing; see agreement."""
@@ -104,17 +118,8 @@ class Textures:
         used = [witnesses[k * len(witnesses) // count] for k in range(count)]
 
         def of(witness: Witness) -> np.ndarray:
-            grey = cv2.cvtColor(witness.photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
-            hidden = witness.hidden | witness.beside
-            shown = (~hidden).astype(np.float32)  # the object's edge is no texture of what is beside it
-            coarse = cv2.GaussianBlur(grey * shown, (0, 0), COARSE) / np.maximum(
-                cv2.GaussianBlur(shown, (0, 0), COARSE), 1e-3
-            )
-            fine = cv2.GaussianBlur(grey * shown, (0, 0), FINE) / np.maximum(
-                cv2.GaussianBlur(shown, (0, 0), FINE), 1e-3
-            )
-            band = np.clip(np.rint(2 * (fine - coarse)), -LOUD, LOUD).astype(np.int8)
-            return np.where(hidden, np.int8(-128), band).ravel()
+            hidden = witness.hidden | witness.beside  # the object's edge is no texture of what is beside it
+            return np.where(hidden, np.int8(-128), texture(witness.photo, ~hidden)).ravel()
 
         values = parallel_map(of, used)
         sizes = np.array([len(v) for v in values], np.int64)
