@@ -64,7 +64,9 @@ def build_parser() -> argparse.ArgumentParser:
     masks.add_argument("--mode", choices=("need", "paper"), default="need")
     masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
     masks.add_argument(
-        "--pictures", metavar="DIR", help="also draw the region over each view, and the surface that would be completed"
+        "--pictures",
+        metavar="DIR",
+        help="also draw the region over each view, the surface that would be completed, and the charts",
     )
     masks.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
     masks.add_argument("--split", choices=("train", "test", "all"), default="train")
@@ -78,8 +80,10 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--out", metavar="OUT.ply")
     remove.add_argument("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
     remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
-    remove.add_argument("--reference", metavar="ID", help="the view to complete first (default: chosen)")
-    remove.add_argument("--reference-image", metavar="FILE", help="that view without the object")
+    remove.add_argument(
+        "--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)"
+    )
+    remove.add_argument("--reference-image", metavar="FILE", help="that view or chart without the object")
     remove.add_argument(
         "--inpaint",
         default="exemplar",

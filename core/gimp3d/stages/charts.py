@@ -6,6 +6,7 @@ A chart's picture is made of all photos with the object left out; what no photo 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,12 @@ UNLIKE = 3.0  # times what photos usually differ by, from which they show differ
 LEAST_SPREAD = 6.0  # grey levels that photos may always differ by
 LEFTOVER = 6  # px round a hole within which what photos do not agree on is taken for a rest of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
+
+
+def chart_number(reference: str | None) -> int | None:
+    """N of the reference chart:N, counted from 1; None for a view's ID."""
+    found = re.fullmatch(rf"{CHART}:(\d+)", reference or "")
+    return int(found[1]) if found else None
 
 
 @dataclass(frozen=True)
