@@ -27,12 +27,12 @@ def show(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> N
 
     A camera that is the reference or the active one stays so under its number.
     """
-    scene = context.scene
-    last = {o[bridge.CHART]: o for o in of_scene(scene)}
+    last = {o[bridge.CHART]: o for o in of_scene(context.scene)}
     found = read_cameras(folder / "transforms.json") if folder.is_dir() else ()
-    if found and not last:
-        scene.collection.children.link(bpy.data.collections.new(COLLECTION))
-    collection = last[min(last)].users_collection[0] if last else scene.collection.children[-1] if found else None
+    collection = next((o.users_collection[0] for o in last.values()), None)
+    if found and collection is None:
+        collection = bpy.data.collections.new(COLLECTION)
+        context.scene.collection.children.link(collection)
     frame = Matrix(bridge.splat_frame(splat).tolist())
     for number, camera in enumerate(found, 1):
         obj = bridge.camera_to_blender(replace(camera, id=f"chart:{number}"), frame)
@@ -44,13 +44,22 @@ def show(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> N
         far = np.median(np.linalg.norm(splats.positions(splat) - camera.centre, axis=1)) * frame.median_scale
         obj.data.clip_end = max(obj.data.clip_end, 2 * far)
         if number in last:
-            last[number].user_remap(obj)
+            _replace(last.pop(number), obj)
         else:
             collection.objects.link(obj)
     for old in last.values():
-        data, name = old.data, old.name
-        bpy.data.objects.remove(old)
-        bpy.data.cameras.remove(data)
+        _replace(old, None)
+
+
+def _replace(old: bpy.types.Object, new: bpy.types.Object | None) -> None:
+    """Put a camera in the place of another one, wherever that is used, and take that away."""
+    if new is not None:
+        old.user_remap(new)
+    name, data = old.name, old.data
+    bpy.data.objects.remove(old)
+    bpy.data.cameras.remove(data)
+    if new is not None:
+        new.name = name
 
 
 def save(chart: bpy.types.Object, folder: Path) -> tuple[Path, Path]:

@@ -64,6 +64,7 @@ from .threads import parallel_map
 R = TypeVar("R")
 DOUBTFUL = 8  # texels round a chart's hole that are filled anew if photos show them beside the object only
 SAME = 0.01  # relative z within which two references show the same surface
+SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
@@ -517,7 +518,8 @@ def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
             break
         rows, cols = open_points.T
         uv, _ = reference.camera.project(points[rows, cols])
-        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], SAME)
+        same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
+        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], same)
         x, y = np.where(seen[:, None], uv, 0).astype(np.float32).T[:, :, None] - np.float32(0.5)
         colours = cv2.remap(reference.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()

@@ -11,7 +11,7 @@ from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
 
-from .. import jobs, splats, steps
+from .. import charts, jobs, splats, steps
 from ..bridge import present
 from ..worker import Killed, Worker, duration
 from .base import RunsChild, current_boxes, current_splat, link, python_of
@@ -40,6 +40,7 @@ class RunsRemoval(RunsChild):
             jobs.close(self.folder)
             raise
         result = bring_back(context, self.folder)
+        charts.show(context, self.folder / jobs.VIEWS / "charts", result)
         jobs.close(self.folder)
         settings, seconds, counts = context.scene.gimp3d, summary["seconds_total"], summary["counts"]
         if self._told and counts["added"] and not self.worker.compiled:
