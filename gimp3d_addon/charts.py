@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras
 
 from . import backdrops, bridge, splats
@@ -63,8 +64,16 @@ def _replace(old: bpy.types.Object, new: bpy.types.Object | None) -> None:
 
 
 def save(chart: bpy.types.Object, folder: Path) -> tuple[Path, Path]:
-    """A chart's picture and the mask of its hole as files, byte for byte as they were written."""
+    """A chart's picture and the mask of its hole as files, byte for byte as they were written.
+
+    Raises
+    ------
+    BadInput
+        If the user has deleted one of the images.
+    """
     paths = folder / "chart.png", folder / "chart.mask.png"
     for path, name in zip(paths, (PICTURE, HOLE)):
+        if chart.get(name) is None:
+            raise BadInput(f"the picture of {chart.name} was deleted; Preview Mask makes it anew")
         path.write_bytes(chart[name].packed_file.data)
     return paths

@@ -141,6 +141,7 @@ def write_masks(
     cameras: Path,
     roi: Path,
     out: Path,
+    images: str | None = None,  # folder; "none": views are rendered from the scene itself
     mode: str = "need",
     split: str = "train",
     frames: Sequence[str] | None = None,
@@ -158,12 +159,12 @@ def write_masks(
     """
     _use_threads(threads)
     gaussians, region = read_scene(scene).gaussians, read_region(roi)
-    available = read_cameras(cameras)
+    available = read_cameras(cameras, _images_folder(images))
     written = select_cameras(available, split, frames)
     names = {c.id for c in written}
     looked_at = [c for c in available if c.split == "train" or c.id in names]  # in the file's order, as a removal does
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    loaded, _ = _load_views(looked_at, None, gaussians)
+    loaded, _ = _load_views(looked_at, images, gaussians)
     photos = {v.camera.id: v.image for v in loaded}
     found = find_masks(
         gaussians,
@@ -314,8 +315,7 @@ def _parse_like(value: Any, text: str) -> Any:
 
 def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
     """The train frames and the reference, whatever its split."""
-    images = Path(job.images) if job.images and job.images != "none" else None
-    available = read_cameras(Path(job.cameras), images)
+    available = read_cameras(Path(job.cameras), _images_folder(job.images))
     reference = _clean_id(job.reference)
     if reference and chart_number(reference) is None and reference not in {c.id for c in available}:
         raise BadInput(f"--reference: no camera {reference}; the file has {available[0].id}, {available[-1].id} …")
@@ -325,6 +325,10 @@ def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
     if not any(c.split == "train" for c in chosen):
         raise BadInput("the camera file has no train frame; remove needs at least one")
     return chosen
+
+
+def _images_folder(images: str | None) -> Path | None:
+    return Path(images) if images and images != "none" else None
 
 
 def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians) -> tuple[list[View], int]:

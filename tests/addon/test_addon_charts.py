@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Euler, Matrix, Vector
 
@@ -71,6 +72,15 @@ def test_charts_lie_in_the_splats_frame_and_are_replaced_by_the_removals(splat: 
     np.testing.assert_allclose([seen.x * camera.width, (1 - seen.y) * camera.height], [u, v], atol=0.05)
     pixels = np.array(chart[charts.PICTURE].pixels).reshape(camera.height, camera.width, 4)[::-1, :, :3]
     assert np.abs(pixels * 255 - read_image(made / "1.png")).max() < 1
+
+
+def test_a_chart_whose_picture_was_deleted_is_one_line(splat: bpy.types.Object, tmp_path: Path) -> None:
+    bpy.ops.gimp3d.preview_masks()
+    bpy.ops.gimp3d.choose_reference(camera="chart:1")
+    bpy.data.images.remove(bpy.data.images["3D-GIMP chart 1"])
+    with pytest.raises(RuntimeError, match="gimp3d: error: .*Preview Mask makes it anew"):
+        bpy.ops.gimp3d.export_reference(filepath=str(tmp_path / "chart.png"))
+    assert not (tmp_path / "chart.png").exists()
 
 
 def test_charts_that_are_no_longer_found_go(splat: bpy.types.Object) -> None:

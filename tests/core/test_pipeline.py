@@ -192,6 +192,13 @@ def test_the_chart_that_is_named_comes_first() -> None:
         np.testing.assert_array_equal(one.image[~one.hole], other.image[~other.hole])
 
 
+def test_a_depth_prior_has_no_say_where_a_chart_is_named() -> None:
+    settings = replace(PRESETS["draft"], depth_prior="planar")
+    result = remove_object(*corner(), CORNER, settings, "chart:1")
+    assert in_turn(result) == ["chart:1", "chart:2"]
+    assert result.warnings == ("--depth-prior planar is not used: the reference is a chart",)
+
+
 def test_the_picture_of_a_chart_is_of_that_chart_alone() -> None:
     first, second = cleared(None).charts
     given = np.where(second.hole[..., None], np.uint8((20, 200, 40)), second.image)
