@@ -82,8 +82,9 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
     mode = "paper" if job.preset == "paper" else "need"
     arguments = [
         "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
-        "--frames", job.reference, *(("--images", job.images) if job.images else ()), "--mode", mode, "--depth-prior", job.depth_prior,
+        "--frames", job.reference, "--mode", mode, "--depth-prior", job.depth_prior,
         "--pictures", str(folder / "pictures"), "--progress", "json",
+        *(("--images", job.images) if job.images else ()),
     ]  # fmt: skip
     return Worker(arguments, python_of(context)), _stem(job.reference)
 

@@ -78,7 +78,7 @@ def test_a_chart_whose_picture_was_deleted_is_one_line(splat: bpy.types.Object, 
     bpy.ops.gimp3d.preview_masks()
     bpy.ops.gimp3d.choose_reference(camera="chart:1")
     bpy.data.images.remove(bpy.data.images["3D-GIMP chart 1"])
-    with pytest.raises(RuntimeError, match="gimp3d: error: .*Preview Mask makes it anew"):
+    with pytest.raises(RuntimeError, match=r"gimp3d: error: .*Preview Mask makes it anew"):
         bpy.ops.gimp3d.export_reference(filepath=str(tmp_path / "chart.png"))
     assert not (tmp_path / "chart.png").exists()
 
