@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Euler, Matrix, Vector
+from scenes import cameras, scene
 
 from gimp3d.io.cameras import read_cameras
-from gimp3d.io.images import read_image
+from gimp3d.io.images import read_image, write_png
+from gimp3d.pipeline import render_bytes
 from gimp3d_addon import bridge, charts, steps
 
 
@@ -34,7 +36,7 @@ def test_a_preview_shows_charts_as_cameras_with_their_pictures(splat: bpy.types.
 
 
 def test_a_chart_is_no_view(splat: bpy.types.Object) -> None:
-    settings, scene = bpy.context.scene.gimp3d, bpy.context.scene
+    settings = bpy.context.scene.gimp3d
     settings.views = "ALL"
     views = steps.views_step(bpy.context).facts
     bpy.ops.gimp3d.preview_masks()
@@ -43,16 +45,18 @@ def test_a_chart_is_no_view(splat: bpy.types.Object) -> None:
     for reference in (None, chart):
         settings.reference = reference
         assert chart not in [obj for _, obj in bridge.views_of(bpy.context, np.eye(4))]
-    scene.camera = chart
+    bpy.context.scene.camera = chart
     bpy.ops.gimp3d.preview_masks()  # of a view
-    assert settings.hole.endswith("in orbit/000") and settings.reference == scene.camera == chart_cameras()[0]
+    assert (
+        settings.hole.endswith("in orbit/000") and settings.reference == bpy.context.scene.camera == chart_cameras()[0]
+    )
     settings.views = "ANIMATED"
     assert "No view" in steps.views_step(bpy.context).missing
 
 
 def test_charts_lie_in_the_splats_frame_and_are_replaced_by_the_removals(splat: bpy.types.Object) -> None:
     bpy.ops.gimp3d.preview_masks()
-    cameras = len(bpy.data.cameras)
+    count = len(bpy.data.cameras)
     moved = Matrix.LocRotScale(Vector((3, -2, 1)), Euler((0.7, -0.4, 1.9)), Vector((1.7, 1.7, 1.7)))
     for obj in [o for o in bpy.context.scene.objects if o.parent is None]:
         obj.matrix_world = moved @ obj.matrix_world
@@ -60,7 +64,7 @@ def test_charts_lie_in_the_splats_frame_and_are_replaced_by_the_removals(splat: 
     bpy.ops.gimp3d.remove_object()
     (chart,) = chart_cameras()
     assert bpy.context.scene.gimp3d.reference == chart and chart.name == "chart:1"
-    assert len(bpy.data.cameras) == cameras
+    assert len(bpy.data.cameras) == count
     made = Path(bpy.context.scene.gimp3d.last_job) / "views" / "charts"
     (camera,) = read_cameras(made / "transforms.json")
     point = np.array([0.1, -0.05, 0.0])
@@ -72,6 +76,23 @@ def test_charts_lie_in_the_splats_frame_and_are_replaced_by_the_removals(splat: 
     np.testing.assert_allclose([seen.x * camera.width, (1 - seen.y) * camera.height], [u, v], atol=0.05)
     pixels = np.array(chart[charts.PICTURE].pixels).reshape(camera.height, camera.width, 4)[::-1, :, :3]
     assert np.abs(pixels * 255 - read_image(made / "1.png")).max() < 1
+
+
+def test_a_preview_has_the_removals_charts(splat: bpy.types.Object, tmp_path: Path) -> None:
+    """Of the photos, which here show the floor under the splats with more contrast."""
+    for camera in cameras():
+        photo = 1.2 * render_bytes(scene(), camera).astype(float) - 25
+        write_png(tmp_path / f"{camera.id}.png", np.clip(photo, 0, 255).astype(np.uint8))
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    bpy.ops.gimp3d.look_through(step=3)
+    bpy.ops.gimp3d.preview_masks()
+    before = charts.save(chart_cameras()[0], tmp_path)
+    pictures = [read_image(p) for p in before]
+    bpy.ops.gimp3d.remove_object()
+    made = Path(bpy.context.scene.gimp3d.last_job) / "views" / "charts"
+    hole = read_image(made / "1.hole.png")
+    np.testing.assert_array_equal(pictures[1], hole)
+    np.testing.assert_array_equal(pictures[0][hole == 0], read_image(made / "1.png")[hole == 0])
 
 
 def test_a_chart_whose_picture_was_deleted_is_one_line(splat: bpy.types.Object, tmp_path: Path) -> None:
