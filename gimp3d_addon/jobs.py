@@ -22,7 +22,6 @@ from . import bridge, splats
 from .operators.base import current_boxes, current_splat
 from .properties import GIMP3D_preferences
 
-VIEWS = "views"  # in a job's folder: the completed views, and charts/
 STATE = "blender.json"  # in a job's folder: what Blender wants back from it
 
 
@@ -131,7 +130,6 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         inpaint=settings.inpaint,
         depth_prior=settings.depth_prior,
         preset=settings.preset,
-        views_out=str(folder / VIEWS),
         report=str(folder / "report"),
         summary=str(folder / "summary.json"),
         seed=settings.seed,

@@ -38,8 +38,8 @@ from .pipeline import (
 )
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .report import draw, write_removal_report
-from .stages.charts import Chart, chart_number
+from .report import draw, write_charts, write_removal_report
+from .stages.charts import chart_number
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -155,7 +155,7 @@ def write_masks(
 
     With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
     the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one; and,
-    if the views are those that a removal would use, charts/, see `_write_charts`.
+    if the views are those that a removal would use, charts/, see `write_charts`.
     """
     _use_threads(threads)
     gaussians, region = read_scene(scene).gaussians, read_region(roi)
@@ -178,7 +178,7 @@ def write_masks(
     settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
     found, charts = with_charts(gaussians, region, found, photos, settings)
     if pictures and all(c.split == "train" for c in written):
-        _write_charts(pictures / "charts", charts)
+        write_charts(pictures / "charts", charts)
     views = {v.camera.id: v for v in found.views}
     for camera in written:
         view = views.get(camera.id)
@@ -246,27 +246,13 @@ def run_removal(
         for name, image in result.painted.items():
             target = Path(job.views_out) / output_name(name)
             write_png(target.with_name(target.name + ".png"), image)
-        _write_charts(Path(job.views_out) / "charts", result.charts)
+        write_charts(Path(job.views_out) / "charts", result.charts)
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), file.gaussians, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
     return summary
-
-
-def _write_charts(folder: Path, charts: Sequence[Chart]) -> None:
-    """What --reference chart:N takes: N.png, the picture; N.hole.png, 255 where it has to be painted; and the cameras.
-
-    The cameras can be read like any, but nobody took a photo there: none is a train frame.
-    """
-    if not charts:
-        return
-    for number, chart in enumerate(charts, 1):
-        write_png(folder / f"{number}.png", chart.image)
-        write_png(folder / f"{number}.hole.png", chart.hole)
-    cameras = [replace(chart.camera, id=f"{number}.png", split="test") for number, chart in enumerate(charts, 1)]
-    write_transforms(folder / "transforms.json", cameras)
 
 
 def job_settings(job: RemovalJob) -> RemovalSettings:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 
 from .gaussians import Gaussians
+from .io.cameras import write_transforms
 from .io.images import write_png
 from .job import write_atomically
 from .pipeline import Picture, RemovalResult, View, render_bytes
@@ -66,8 +68,7 @@ def write_removal_report(
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
         flips.append((camera_id, f"view_{k:02d}.png"))
         write_png(folder / flips[-1][1], image)
-    for number, chart in enumerate(result.charts, 1):
-        write_png(folder / f"chart_{number}_filled.png", chart.image)
+    write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
         write_png(folder / f"chart_{number}.png", draw(picture))
     stage_pictures = []
@@ -78,6 +79,20 @@ def write_removal_report(
     page = _page(summary, pairs, flips, stage_pictures, result.charts, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
+
+
+def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
+    """What --reference chart:N takes: N.png, the picture; N.hole.png, 255 where it has to be painted; and the cameras.
+
+    The cameras can be read like any, but nobody took a photo there: none is a train frame.
+    """
+    if not charts:
+        return
+    for number, chart in enumerate(charts, 1):
+        write_png(folder / f"{number}.png", chart.image)
+        write_png(folder / f"{number}.hole.png", chart.hole)
+    cameras = [replace(chart.camera, id=f"{number}.png", split="test") for number, chart in enumerate(charts, 1)]
+    write_transforms(folder / "transforms.json", cameras)
 
 
 def draw(picture: Picture) -> np.ndarray:
@@ -264,7 +279,7 @@ def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
         f"<td>{html.escape(chart.reason)}</td></tr>"
         f"<tr><td colspan=6><div class=pair><figure><img src='chart_{k}.png' alt='hole'>"
         "<figcaption>What photos show; red: the hole</figcaption></figure>"
-        f"<figure><img src='chart_{k}_filled.png' alt='completed'><figcaption>Completed</figcaption></figure></div>"
+        f"<figure><img src='charts/{k}.png' alt='completed'><figcaption>Completed</figcaption></figure></div>"
         "</td></tr>"
         for k, (chart, facts) in enumerate(zip(charts, summary["charts"]), 1)
     )

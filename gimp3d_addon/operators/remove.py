@@ -40,8 +40,8 @@ class RunsRemoval(RunsChild):
             jobs.close(self.folder)
             raise
         result = bring_back(context, self.folder)
-        charts.show(context, self.folder / jobs.VIEWS / "charts", result)
         jobs.close(self.folder)
+        charts.show(context, self.folder / "report" / "charts", result)
         settings, seconds, counts = context.scene.gimp3d, summary["seconds_total"], summary["counts"]
         if self._told and counts["added"] and not self.worker.compiled:
             settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever

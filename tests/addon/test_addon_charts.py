@@ -65,7 +65,7 @@ def test_charts_lie_in_the_splats_frame_and_are_replaced_by_the_removals(splat: 
     (chart,) = chart_cameras()
     assert bpy.context.scene.gimp3d.reference == chart and chart.name == "chart:1"
     assert len(bpy.data.cameras) == count
-    made = Path(bpy.context.scene.gimp3d.last_job) / "views" / "charts"
+    made = Path(bpy.context.scene.gimp3d.last_job) / "report" / "charts"
     (camera,) = read_cameras(made / "transforms.json")
     point = np.array([0.1, -0.05, 0.0])
     (u, v), _ = camera.project(point)
@@ -89,7 +89,7 @@ def test_a_preview_has_the_removals_charts(splat: bpy.types.Object, tmp_path: Pa
     before = charts.save(chart_cameras()[0], tmp_path)
     pictures = [read_image(p) for p in before]
     bpy.ops.gimp3d.remove_object()
-    made = Path(bpy.context.scene.gimp3d.last_job) / "views" / "charts"
+    made = Path(bpy.context.scene.gimp3d.last_job) / "report" / "charts"
     hole = read_image(made / "1.hole.png")
     np.testing.assert_array_equal(pictures[1], hole)
     np.testing.assert_array_equal(pictures[0][hole == 0], read_image(made / "1.png")[hole == 0])

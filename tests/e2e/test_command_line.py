@@ -199,7 +199,7 @@ def test_a_painted_chart_rules_its_hole(scene_folder: Path, completed: Path, tmp
     assert "picture pasted as it is" in next(s["reason"] for s in summary["stages"] if s["name"] == "appearance")
     page = (tmp_path / "report" / "index.html").read_text()
     assert "<td>chart:1</td>" in page
-    np.testing.assert_array_equal(read_image(tmp_path / "report" / "chart_1_filled.png"), painted)
+    np.testing.assert_array_equal(read_image(tmp_path / "report" / "charts" / "1.png"), painted)
     assert (read_image(tmp_path / "report" / "chart_1.png")[hole][:, 0] > 100).all()  # the hole is marked in red
     filled = read_ply(tmp_path / "out.ply").gaussians
     green = [render_bytes(filled, c).astype(int) @ [-1, 2, -1] > 120 for c in cameras()]
