@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import Gaussians
+from gimp3d.io.images import write_png
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import (
     PRESETS,
@@ -208,6 +210,16 @@ def test_the_picture_of_a_chart_is_of_that_chart_alone() -> None:
     wall = painted.charts[0]
     np.testing.assert_array_equal(wall.image[~wall.hole], first.image[~first.hole])
     assert (wall.image[wall.hole].astype(int) @ [-1, 2, -1] > 120).mean() < 0.05  # hardly any green
+
+
+def test_a_file_that_fills_is_of_the_chart_that_is_named(tmp_path: Path) -> None:
+    second = cleared(None).charts[1]
+    given = np.where(second.hole[..., None], np.uint8((20, 200, 40)), second.image)
+    write_png(tmp_path / "given.png", given)
+    settings = replace(PRESETS["draft"], inpaint=f"file:{tmp_path / 'given.png'}")
+    wall, ground = remove_object(*corner(), CORNER, settings, "chart:2").charts
+    assert ((ground.image == given).all(-1) | ~second.hole).mean() > 0.99
+    assert (wall.image[wall.hole].astype(int) @ [-1, 2, -1] > 120).mean() < 0.05
 
 
 def test_a_picture_in_another_light_is_levelled_by_what_photos_show_of_the_chart() -> None:
