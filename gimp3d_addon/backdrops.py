@@ -34,9 +34,9 @@ def put_over(camera: bpy.types.Object, image: bpy.types.Image) -> None:
     _place(camera, image, "FRONT")
 
 
-def put_behind(camera: bpy.types.Object, photo: Path) -> None:
-    """Show a photo behind what the camera sees."""
-    _place(camera, bpy.data.images.load(str(photo), check_existing=True), "BACK")
+def put_behind(camera: bpy.types.Object, image: bpy.types.Image) -> None:
+    """Show a photo, or a chart's picture, behind what the camera sees."""
+    _place(camera, image, "BACK")
 
 
 def take_away(camera: bpy.types.Object) -> bool:

@@ -22,6 +22,7 @@ from gimp3d.errors import BadInput
 
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
+CHART = "gimp3d_chart"  # custom property of cameras that face a hidden surface: N of the reference chart:N
 SENSOR = 36.0  # mm, of imported cameras
 STRAIGHT = 1e-6  # from here on a turn is meant: Blender's own quarter turns are off by 4e-8
 
@@ -132,6 +133,11 @@ def has_photo(obj: bpy.types.Object) -> bool:
     return photo_of(obj) is not None
 
 
+def is_chart(obj: bpy.types.Object | None) -> bool:
+    """Whether a camera faces a chart: nothing can be seen from there but its picture, so it is no view."""
+    return obj is not None and CHART in obj
+
+
 def _moved(viewmat: np.ndarray, imported: np.ndarray, frame: np.ndarray) -> bool:
     """Whether a camera left the place where its photo was taken, by more than Blender's float32 does."""
     reach = np.linalg.norm(imported[:3, 3]) + np.linalg.norm(np.linalg.inv(frame)[:3, 3])
@@ -227,7 +233,7 @@ def _chosen_views(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tup
         for obj in chosen:
             yield camera_from_blender(obj, frame, scene, depsgraph), obj
     reference = present(scene, settings.reference)
-    if reference is not None and reference not in chosen:
+    if reference is not None and reference not in chosen and not is_chart(reference):
         yield camera_from_blender(reference, frame, scene, context.evaluated_depsgraph_get()), reference
 
 
@@ -250,7 +256,7 @@ def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
     """
     scene, settings = context.scene, context.scene.gimp3d
     if settings.views == "ANIMATED":
-        cameras = [scene.camera] if scene.camera else []
+        cameras = [scene.camera] if scene.camera and not is_chart(scene.camera) else []
         times = len(range(scene.frame_start, scene.frame_end + 1, scene.frame_step))
     else:
         cameras, times = chosen_cameras(scene), 1
@@ -270,7 +276,12 @@ def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
         pool: Iterable[bpy.types.Object] = (o for o in settings.view_collection.all_objects if present(scene, o))
     else:
         pool = scene.objects
-    return sorted((o for o in pool if o.type == "CAMERA"), key=lambda o: (_number(o), o.name))
+    return sorted((o for o in pool if o.type == "CAMERA" and not is_chart(o)), key=lambda o: (_number(o), o.name))
+
+
+def is_view(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> bool:
+    """Whether a camera is one of the chosen views, rather than the reference beside them."""
+    return camera == scene.camera if scene.gimp3d.views == "ANIMATED" else camera in chosen_cameras(scene)
 
 
 def _number(obj: bpy.types.Object) -> int:
@@ -279,7 +290,7 @@ def _number(obj: bpy.types.Object) -> int:
 
 def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
     scene, obj = context.scene, context.scene.camera
-    if obj is None:
+    if obj is None or is_chart(obj):
         raise BadInput("the scene has no active camera whose frames could be the views")
     current = scene.frame_current, scene.frame_subframe
     try:

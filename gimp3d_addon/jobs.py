@@ -80,7 +80,7 @@ def _write_state(folder: Path, state: dict[str, Any]) -> None:
     write_atomically(folder / STATE, lambda f: f.write(json.dumps(state).encode()))
 
 
-def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True) -> RemovalJob:
+def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     """The scene, cameras, region, photos and settings as a job folder; returns the job with absolute paths.
 
     Raises
@@ -97,7 +97,8 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     context.view_layer.update()
     frame = bridge.splat_frame(splat)
     region = [bridge.box_from_blender(b, frame).to_json() for b in boxes]
-    wanted, reference = bridge.present(context.scene, settings.reference), ""
+    wanted = bridge.present(context.scene, settings.reference)
+    reference = f"chart:{wanted[bridge.CHART]}" if bridge.is_chart(wanted) else ""
     views = list(bridge.views_of(context, frame))
     for camera, obj in views:
         if wanted is not None and obj == wanted and not reference:
@@ -111,7 +112,7 @@ def write_job(context: bpy.types.Context, folder: Path, with_photos: bool = True
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
-    write_transforms(folder / "transforms.json", [_with_photo(c, folder) if with_photos else c for c, _ in views])
+    write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
         shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")

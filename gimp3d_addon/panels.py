@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 from bl_ui.utils import PresetPanel
 
-from . import jobs, splats, steps
+from . import charts, jobs, splats, steps
 from .operators.base import RunsChild, current_splat
 from .operators.display import unfit_settings
 from .operators.remove import source_in
@@ -229,6 +229,8 @@ class GIMP3D_PT_reference(Advanced, bpy.types.Panel):
             layout.label(text="Chosen by the program", icon="INFO")
         layout.prop(settings, "reference", text="")
         layout.operator("gimp3d.choose_reference")
+        for chart in charts.of_scene(context.scene):
+            layout.operator("gimp3d.look_through", text=f"Look at {chart.name}", icon="VIEW_ORTHO").camera = chart.name
         layout.label(text="Paint it without the object")
         row = layout.row(align=True)
         row.operator("gimp3d.export_reference", text="Export")

@@ -56,7 +56,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     reference: PointerProperty(
         type=bpy.types.Object,
         name="Reference",
-        description="The view to complete first; empty: the program chooses",
+        description="The view or chart to complete first; empty: the program chooses",
         poll=lambda _, candidate: candidate.type == "CAMERA",
     )
     reference_image: StringProperty(

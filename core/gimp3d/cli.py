@@ -25,6 +25,7 @@ from .job import RemovalJob, load_job, save_job
 
 Namespace = argparse.Namespace
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
+IMAGES = "photos; none: views are rendered from the scene"
 EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
 
 
@@ -61,10 +62,13 @@ def build_parser() -> argparse.ArgumentParser:
     _scene_and_cameras(masks)
     masks.add_argument("--roi", required=True)
     masks.add_argument("--out", required=True, metavar="DIR")
+    masks.add_argument("--images", metavar="DIR|none", help=IMAGES)
     masks.add_argument("--mode", choices=("need", "paper"), default="need")
     masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
     masks.add_argument(
-        "--pictures", metavar="DIR", help="also draw the region over each view, and the surface that would be completed"
+        "--pictures",
+        metavar="DIR",
+        help="also draw the region over each view, the surface that would be completed, and the charts",
     )
     masks.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
     masks.add_argument("--split", choices=("train", "test", "all"), default="train")
@@ -76,10 +80,12 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--cameras")
     remove.add_argument("--roi")
     remove.add_argument("--out", metavar="OUT.ply")
-    remove.add_argument("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
+    remove.add_argument("--images", metavar="DIR|none", help=IMAGES)
     remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
-    remove.add_argument("--reference", metavar="ID", help="the view to complete first (default: chosen)")
-    remove.add_argument("--reference-image", metavar="FILE", help="that view without the object")
+    remove.add_argument(
+        "--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)"
+    )
+    remove.add_argument("--reference-image", metavar="FILE", help="that view or chart without the object")
     remove.add_argument(
         "--inpaint",
         default="exemplar",
@@ -230,6 +236,7 @@ def _masks(given: Namespace, shown: Reporter) -> None:
         Path(given.cameras),
         Path(given.roi),
         Path(given.out),
+        images=given.images,
         mode=given.mode,
         split=given.split,
         frames=_names(given.frames),

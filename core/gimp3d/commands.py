@@ -38,8 +38,8 @@ from .pipeline import (
 )
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .report import draw, write_removal_report
-from .stages.charts import Chart
+from .report import draw, write_charts, write_removal_report
+from .stages.charts import chart_number
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -141,6 +141,7 @@ def write_masks(
     cameras: Path,
     roi: Path,
     out: Path,
+    images: str | None = None,  # folder; "none": views are rendered from the scene itself
     mode: str = "need",
     split: str = "train",
     frames: Sequence[str] | None = None,
@@ -153,29 +154,31 @@ def write_masks(
     """Write every view's target region as a 0/255 picture (CONTRACT: masks).
 
     With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
-    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one.
+    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one; and,
+    if the views are those that a removal would use, charts/, see `write_charts`.
     """
     _use_threads(threads)
     gaussians, region = read_scene(scene).gaussians, read_region(roi)
-    available = read_cameras(cameras)
+    available = read_cameras(cameras, _images_folder(images))
     written = select_cameras(available, split, frames)
     names = {c.id for c in written}
-    looked_at = [*written, *(c for c in available if c.split == "train" and c.id not in names)]
+    looked_at = [c for c in available if c.split == "train" or c.id in names]  # in the file's order, as a removal does
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    with_photo = [c for c in looked_at if c.split == "train" and c.image is not None and c.image.exists()]
-    photos = dict(zip((c.id for c in with_photo), parallel_map(lambda c: load_view(c)[0], with_photo)))
+    loaded, _ = _load_views(looked_at, images, gaussians)
+    photos = {v.camera.id: v.image for v in loaded}
     found = find_masks(
         gaussians,
         region,
-        [undistorted(c) for c in looked_at],
+        [v.camera for v in loaded],
         MaskSettings(mode=mode),
         progress,
         photos,
         _read_extra_masks(extra_masks, looked_at),
     )
     settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
-    drawn = {v.camera.id: render_bytes(gaussians, v.camera) for v in found.views if v.camera.id not in photos}
-    found = with_charts(gaussians, region, found, photos | drawn, settings)
+    found, charts = with_charts(gaussians, region, found, photos, settings)
+    if pictures and all(c.split == "train" for c in written):
+        write_charts(pictures / "charts", charts)
     views = {v.camera.id: v for v in found.views}
     for camera in written:
         view = views.get(camera.id)
@@ -183,10 +186,8 @@ def write_masks(
         target = out / output_name(camera.id)
         write_png(target.with_name(target.name + ".png"), view.target if view else empty)
         if pictures and view:
-            picture = photos.get(camera.id)
-            shown = render_bytes(gaussians, view.camera) if picture is None else picture
             target = pictures / output_name(camera.id)
-            for looked in preview(view, found.views, shown, settings):
+            for looked in preview(view, found.views, photos[camera.id], settings):
                 write_png(target.with_name(f"{target.name}.{looked.kind}.png"), draw(looked))
 
 
@@ -230,7 +231,7 @@ def run_removal(
     cameras = _removal_cameras(job)
     warnings = list(_scene_warnings(file))
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    views, rendered = _load_views(cameras, job, file)
+    views, rendered = _load_views(cameras, job.images, file.gaussians)
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     given = read_image(Path(job.reference_image)) if job.reference_image else None
@@ -245,23 +246,13 @@ def run_removal(
         for name, image in result.painted.items():
             target = Path(job.views_out) / output_name(name)
             write_png(target.with_name(target.name + ".png"), image)
-        _write_charts(Path(job.views_out) / "charts", result.charts)
+        write_charts(Path(job.views_out) / "charts", result.charts)
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), file.gaussians, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
     return summary
-
-
-def _write_charts(folder: Path, charts: Sequence[Chart]) -> None:
-    """The charts' pictures and their cameras (CONTRACT: --views-out)."""
-    if not charts:
-        return
-    for number, chart in enumerate(charts, 1):
-        write_png(folder / f"{number}.png", chart.image)
-    cameras = [replace(chart.camera, id=f"{number}.png") for number, chart in enumerate(charts, 1)]
-    write_transforms(folder / "transforms.json", cameras)
 
 
 def job_settings(job: RemovalJob) -> RemovalSettings:
@@ -310,29 +301,32 @@ def _parse_like(value: Any, text: str) -> Any:
 
 def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
     """The train frames and the reference, whatever its split."""
-    images = Path(job.images) if job.images and job.images != "none" else None
-    available = read_cameras(Path(job.cameras), images)
+    available = read_cameras(Path(job.cameras), _images_folder(job.images))
     reference = _clean_id(job.reference)
-    if reference and reference not in {c.id for c in available}:
+    if reference and chart_number(reference) is None and reference not in {c.id for c in available}:
         raise BadInput(f"--reference: no camera {reference}; the file has {available[0].id}, {available[-1].id} …")
     if job.reference_image and not reference:
-        raise BadInput("--reference-image needs --reference ID, the camera that the picture was taken from")
+        raise BadInput("--reference-image needs --reference, the camera or chart:N that the picture is of")
     chosen = tuple(c for c in available if c.split == "train" or c.id == reference)
     if not any(c.split == "train" for c in chosen):
         raise BadInput("the camera file has no train frame; remove needs at least one")
     return chosen
 
 
-def _load_views(cameras: Sequence[Camera], job: RemovalJob, file: SplatFile) -> tuple[list[View], int]:
+def _images_folder(images: str | None) -> Path | None:
+    return Path(images) if images and images != "none" else None
+
+
+def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians) -> tuple[list[View], int]:
     """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene."""
 
     def load(camera: Camera) -> tuple[View, bool]:
-        wanted = job.images != "none" and camera.split == "train"
+        wanted = images != "none" and camera.split == "train"
         if wanted and camera.image is not None and camera.image.exists():
             image, pinhole = load_view(camera)
             return View(pinhole, image), False
         pinhole = undistorted(camera)
-        return View(pinhole, render_bytes(file.gaussians, pinhole)), wanted
+        return View(pinhole, render_bytes(scene, pinhole)), wanted
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)

@@ -15,14 +15,14 @@ import scipy.ndimage
 from . import buffers
 from .box import Region
 from .camera import Camera
-from .errors import IllPosed
+from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
-from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, draw_charts, find_planes
+from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_number, draw_charts, find_planes
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
@@ -64,6 +64,7 @@ from .threads import parallel_map
 R = TypeVar("R")
 DOUBTFUL = 8  # texels round a chart's hole that are filled anew if photos show them beside the object only
 SAME = 0.01  # relative z within which two references show the same surface
+SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
@@ -132,10 +133,10 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | depth | fit | appearance | mapping | rules
+    kind: str  # mask | chart | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (hole) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
     data: tuple[np.ndarray, ...]
 
 
@@ -151,7 +152,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
-    charts: tuple[Chart, ...] = ()  # as completed
+    charts: tuple[Chart, ...] = ()  # as completed; see _to_paint
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
@@ -203,7 +204,7 @@ def remove_object(
     region: Region,
     settings: RemovalSettings = RemovalSettings(),
     reference: str | None = None,
-    reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference view without the object
+    reference_image: np.ndarray | None = None,  # [H, W, 3] uint8, the reference without the object
     progress: Progress = silent,
     store: Store | None = None,
     extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
@@ -215,14 +216,14 @@ def remove_object(
     views
         Training views and, if it is another one, the reference view. Their images show the scene with the object.
     reference
-        ID of the reference view; None chooses one.
+        ID of the reference view, or chart:N as numbered in the result's charts; None chooses.
     reference_image
-        What the reference view looks like without the object; None fills it by `settings.inpaint`.
+        What the reference looks like without the object; None fills it by `settings.inpaint`.
 
     Raises
     ------
     BadInput
-        If a provider cannot be used.
+        If a provider cannot be used, or the chart that is named does not exist.
     IllPosed
         If the task has no defined answer, with the reason.
     """
@@ -247,6 +248,9 @@ def remove_object(
             charts, open_views = charted.charts, charted.targets.views
             hits = {v.camera.id: h for v, h in zip(open_views, charted.targets.hits)}
             masks = replace(masks, selection=charted.selection, views=open_views)
+    named = _named_chart(reference, charts, settings)
+    shown = _to_paint(charts, open_views, hits)
+    run.pictures += [Picture("chart", f"What photos show of {c.camera.id}", c.image, (c.hole,)) for c in shown]
     keep = ~masks.removed
     kept = scene.take(keep)
     for v in _spread(open_views):
@@ -269,20 +273,38 @@ def remove_object(
     # a picture or a depth that belongs to a view needs that view
     of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
     as_photo = not charts or reference is not None or of_view
-    sources: list[Chart | None] = [None] * (as_photo * (1 + settings.extra_references))
+    numbers = range(len(charts))
+    turns: list[int | None] = [*[None] * (as_photo * (1 + settings.extra_references)), *numbers]
+    if named is not None:
+        turns = [named, *(k for k in numbers if k != named)]
+        if settings.depth_prior != "auto":
+            run.warnings.append(f"--depth-prior {settings.depth_prior} is not used: the reference is a chart")
     done: list[Reference] = []
-    for round_, chart in enumerate([*sources, *charts]):
+    for round_, number in enumerate(turns):
         buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
         suffix = "" if first else f" {round_ + 1}"
         try:
-            if chart is not None:
+            if number is not None:
                 step = _fill_from_chart(
-                    run, suffix, _carried_over(chart, done), filled, open_views, hits, levelled, painted, settings
+                    run,
+                    suffix,
+                    _carried_over(charts[number], done),
+                    number,
+                    filled,
+                    open_views,
+                    hits,
+                    levelled,
+                    painted,
+                    settings,
+                    number == named,
+                    reference_image if number == named else None,
                 )
                 if step is None:
+                    if number == named:
+                        run.warnings.append(f"--reference {reference}: no view needs this chart, it is not used")
                     continue
                 completed, new, painting = step
             else:
@@ -328,8 +350,24 @@ def remove_object(
 
     parallel_map(finish, masks.views)
     pictures = {r.camera.id: r.image for r in done}
-    charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in charts)
+    charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in shown)
     return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left)
+
+
+def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
+    """The index of the chart that the reference names; None if it names a view, or nothing."""
+    number = chart_number(reference)
+    if number is None:
+        return None
+    if not charts:
+        why = "photos are the only references of this preset" if settings.charts is None else "no chart is found here"
+        raise BadInput(f"--reference {reference}: {why}; name a view")
+    if not 1 <= number <= len(charts):
+        there = (
+            "is 1 chart, chart:1" if len(charts) == 1 else f"are {len(charts)} charts, chart:1 to chart:{len(charts)}"
+        )
+        raise BadInput(f"--reference {reference}: there {there}")
+    return number - 1
 
 
 def _exposures(scene: Gaussians, masks: Masks, photos: Mapping[str, np.ndarray]) -> dict[str, Exposure]:
@@ -349,15 +387,20 @@ def with_charts(
     masks: Masks,
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
     settings: RemovalSettings = RemovalSettings(),
-) -> Masks:
-    """The masks that a removal really uses: their targets are what no photo shows of the charts, if there are any."""
+) -> tuple[Masks, tuple[Chart, ...]]:
+    """The masks that a removal really uses, and its charts with what photos show of them (see _to_paint).
+
+    If there are any, the masks' targets are what no photo shows of them.
+    """
     if settings.charts is None or masks.mode != "need" or not masks.removed.any():
-        return masks
+        return masks, ()
     levelled = {name: e.image for name, e in _exposures(scene, masks, photos).items()}
     charted = _chart(scene, region, masks, levelled, settings)
     if not charted.charts:
-        return masks
-    return replace(masks, selection=charted.selection, views=charted.targets.views)
+        return masks, ()
+    masks = replace(masks, selection=charted.selection, views=charted.targets.views)
+    hits = {v.camera.id: h for v, h in zip(masks.views, charted.targets.hits)}
+    return masks, _to_paint(charted.charts, masks.views, hits)
 
 
 @dataclass(frozen=True)
@@ -404,32 +447,37 @@ def _fill_from_chart(
     run: _Run,
     suffix: str,
     chart: Chart,
+    number: int,  # its index
     filled: Gaussians,
     open_views: Sequence[ViewMasks],
     hits: dict[str, Hits],
     photos: dict[str, np.ndarray],
     painted: dict[str, np.ndarray],
     settings: RemovalSettings,
+    named: bool = False,  # the user's reference
+    given: np.ndarray | None = None,  # [H, W, 3] uint8, its picture
 ) -> tuple[Reference, Gaussians, Propagation] | None:
     """Complete one chart, carry it into every view, and make its Gaussians; None if no view needs it."""
-    number = int(chart.camera.id.rpartition(":")[2]) - 1
-    target = _needed_texels(chart, number, open_views, hits)
+    target, hole = _texels_to_fill(chart, number, open_views, hits)
     if not target.any():
         return None
-    hole = target & (chart.hole | (chart.photos == 0))
-    hole |= chart.beside & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * DOUBTFUL + 1,) * 2, np.uint8)) > 0)
-    appearance: Appearance = run(
-        f"appearance{suffix}",
-        lambda: inpaint_reference(
-            "exemplar" if settings.inpaint.startswith("file:") else settings.inpaint,  # a file shows one view
+
+    def complete() -> Appearance:
+        if given is not None:
+            return paste_picture(chart.image, hole | chart.hole, given, "--reference-image", chart.known)
+        of_another = settings.inpaint.startswith("file:") and not named
+        return inpaint_reference(
+            "exemplar" if of_another else settings.inpaint,
             chart.image,
             hole,
             settings.random_seed,
             None if chart.kind == "plane" else disparity_of(chart.depth),
             chart.camera.K,
             ~chart.known & ~hole,
-        ),
-    )
+        )
+
+    appearance: Appearance = run(f"appearance{suffix}", complete)
+    run.warnings += appearance.warnings
     source = ~target & ~hole & chart.known
 
     def to_paint(v: ViewMasks, _: Gaussians) -> ViewToPaint:
@@ -470,7 +518,8 @@ def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
             break
         rows, cols = open_points.T
         uv, _ = reference.camera.project(points[rows, cols])
-        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], SAME)
+        same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
+        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], same)
         x, y = np.where(seen[:, None], uv, 0).astype(np.float32).T[:, :, None] - np.float32(0.5)
         colours = cv2.remap(reference.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
@@ -489,6 +538,23 @@ def snapped(
     """The depth, but the chart's where it is the chart's surface: splats' depths are rough, photos place charts."""
     same = (there > 0) & (np.abs(depth - there) < tolerance * there)
     return np.where(same, there, depth)
+
+
+def _texels_to_fill(
+    chart: Chart, number: int, views: Sequence[ViewMasks], hits: dict[str, Hits]
+) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool each: texels that views need, and those that are filled for that, as no photo shows them well."""
+    target = _needed_texels(chart, number, views, hits)
+    hole = target & (chart.hole | (chart.photos == 0))
+    hole |= chart.beside & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * DOUBTFUL + 1,) * 2, np.uint8)) > 0)
+    return target, hole
+
+
+def _to_paint(charts: Sequence[Chart], views: Sequence[ViewMasks], hits: dict[str, Hits]) -> tuple[Chart, ...]:
+    """The charts as a user gets them: the hole is all that a picture of one has to show."""
+    return tuple(
+        replace(c, hole=c.hole | _texels_to_fill(c, number, views, hits)[1]) for number, c in enumerate(charts)
+    )
 
 
 def _needed_texels(chart: Chart, number: int, views: Sequence[ViewMasks], hits: dict[str, Hits]) -> np.ndarray:

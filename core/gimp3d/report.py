@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ import cv2
 import numpy as np
 
 from .gaussians import Gaussians
+from .io.cameras import write_transforms
 from .io.images import write_png
 from .job import write_atomically
 from .pipeline import Picture, RemovalResult, View, render_bytes
+from .stages.charts import Chart
 from .stages.propagate import Rule
 from .stages.reference import ReferenceChoice
 
@@ -40,6 +43,7 @@ figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}
 .flip:hover img+img{opacity:1}
 .book{max-width:720px}.book input{width:100%}
+.pair{display:flex;gap:1rem}.pair figure{flex:1}
 .bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
 .warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
 .dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
@@ -64,19 +68,36 @@ def write_removal_report(
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
         flips.append((camera_id, f"view_{k:02d}.png"))
         write_png(folder / flips[-1][1], image)
+    write_charts(folder / "charts", result.charts)
+    for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
+        write_png(folder / f"chart_{number}.png", draw(picture))
     stage_pictures = []
-    for k, picture in enumerate(result.pictures):
+    for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
         stage_pictures.append((picture.title, name, picture.kind == "rules"))
-    page = _page(summary, pairs, flips, stage_pictures, result.references)
+    page = _page(summary, pairs, flips, stage_pictures, result.charts, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
 
 
+def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
+    """What --reference chart:N takes: N.png, the picture; N.hole.png, 255 where it has to be painted; and the cameras.
+
+    The cameras can be read like any, but nobody took a photo there: none is a train frame.
+    """
+    if not charts:
+        return
+    for number, chart in enumerate(charts, 1):
+        write_png(folder / f"{number}.png", chart.image)
+        write_png(folder / f"{number}.hole.png", chart.hole)
+    cameras = [replace(chart.camera, id=f"{number}.png", split="test") for number, chart in enumerate(charts, 1)]
+    write_transforms(folder / "transforms.json", cameras)
+
+
 def draw(picture: Picture) -> np.ndarray:
     """A stage's result as a picture, [H, W, 3] uint8."""
-    if picture.kind == "mask":
+    if picture.kind in ("mask", "chart"):
         return tinted(picture.image, picture.data[0], (230, 60, 60))
     if picture.kind == "depth":
         return relief(picture.data[0], picture.data[1])
@@ -187,6 +208,7 @@ def _page(
     pairs: Sequence[tuple[str, str, str]],
     flips: Sequence[tuple[str, str]],
     pictures: Sequence[tuple[str, str, bool]],  # title, file, whether it takes a row of its own
+    charts: Sequence[Chart],
     choices: Sequence[ReferenceChoice],
 ) -> str:
     counts, text = summary["counts"], html.escape
@@ -225,7 +247,7 @@ def _page(
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"{_flip_book(flips)}"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
-        f"{_references(choices)}"
+        f"{_charts(charts, summary)}{_references(choices)}"
         f"<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. {legend}</p>"
         f"<div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
@@ -245,6 +267,27 @@ def _flip_book(flips: Sequence[tuple[str, str]]) -> str:
     turn = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k != value)"
     slider = f"<input type=range min=0 max={len(flips) - 1} value=0 aria-label=view oninput='{turn}'>"
     return f"<h2>Painted views</h2><div class=book>{slider}<div>{figures}</div></div>"
+
+
+def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
+    """The hidden surfaces straight on: what photos show of each, and its completed picture."""
+    if not charts:
+        return ""
+    rows = "".join(
+        f"<tr><td>chart:{k}</td><td>{facts['kind']}</td><td class=n>{facts['texels']:,}</td>"
+        f"<td class=n>{facts['hole_texels']:,}</td><td class=n>{facts['photos_median']:.0f}</td>"
+        f"<td>{html.escape(chart.reason)}</td></tr>"
+        f"<tr><td colspan=6><div class=pair><figure><img src='chart_{k}.png' alt='hole'>"
+        "<figcaption>What photos show; red: the hole</figcaption></figure>"
+        f"<figure><img src='charts/{k}.png' alt='completed'><figcaption>Completed</figcaption></figure></div>"
+        "</td></tr>"
+        for k, (chart, facts) in enumerate(zip(charts, summary["charts"]), 1)
+    )
+    return (
+        "<h2>Charts</h2><p>The surfaces behind the object, straight on. To paint one: <code>--reference chart:N "
+        "--reference-image FILE</code>.</p><table><tr><th>chart<th>kind<th>texels<th>hole<th>photos of a texel"
+        f"<th>why</tr>{rows}</table>"
+    )
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:

@@ -16,9 +16,9 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob
 
-from .. import backdrops, bridge, jobs, splats
+from .. import backdrops, bridge, charts, jobs, splats
 from ..worker import Worker
-from .base import ReportsErrors, RunsChild, current_boxes, current_splat, python_of
+from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, python_of
 
 PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior"}
 VIEW = "view"  # ID of the one camera that is drawn
@@ -29,6 +29,15 @@ def _camera(context: bpy.types.Context) -> bpy.types.Object:
     if found is None:
         raise BadInput("no camera; choose a reference view or set the scene's active camera")
     return found
+
+
+def _view(context: bpy.types.Context) -> bpy.types.Object:
+    """The same, but never a chart: the first view then."""
+    found = _camera(context)
+    if not bridge.is_chart(found):
+        return found
+    views = [context.scene.camera, *bridge.chosen_cameras(context.scene)]
+    return next((v for v in views if v is not None and not bridge.is_chart(v)), found)
 
 
 class RunsInPassing(RunsChild):
@@ -65,7 +74,7 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
     settings = context.scene.gimp3d
     chosen, settings.reference = settings.reference, camera  # the camera must be among the job's views
     try:
-        job: RemovalJob = jobs.write_job(context, folder, with_photos=False)
+        job: RemovalJob = jobs.write_job(context, folder)
     finally:
         settings.reference = chosen
     if not job.reference:
@@ -75,6 +84,7 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
         "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
         "--frames", job.reference, "--mode", mode, "--depth-prior", job.depth_prior,
         "--pictures", str(folder / "pictures"), "--progress", "json",
+        *(("--images", job.images) if job.images else ()),
     ]  # fmt: skip
     return Worker(arguments, python_of(context)), _stem(job.reference)
 
@@ -127,7 +137,7 @@ class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
         return current_splat(context) is not None and bool(current_boxes(context))
 
     def start(self, context: bpy.types.Context) -> Worker:
-        camera = _camera(context)
+        camera = _view(context)
         self._camera = camera.name
         worker, self._stem = _look(context, camera, self.new_folder())
         return worker
@@ -145,6 +155,8 @@ class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
                 image = backdrops.load_picture(drawn, title)
                 shown = image if kind == "mask" else shown
         _show(context, self._camera, shown)
+        if bridge.is_view(context.scene, context.scene.objects.get(self._camera)):  # else a removal has other charts
+            charts.show(context, folder / "pictures" / "charts", current_splat(context))
 
 
 class GIMP3D_OT_hide_previews(ReportsErrors, bpy.types.Operator):
@@ -181,7 +193,10 @@ class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
 
 
 class RunsReference(RunsInPassing):
-    """Mixin: a child for the mask, then one for the picture of the reference view; `deliver` takes both files."""
+    """Mixin: a child for the mask, then one for the picture of the reference view; `deliver` takes both files.
+
+    A chart's are there already, and no child is needed.
+    """
 
     _drawing = False
 
@@ -189,6 +204,18 @@ class RunsReference(RunsInPassing):
     def poll(cls, context: bpy.types.Context) -> bool:
         cls.poll_message_set("Import a splat scene and put a box round the object first")
         return current_splat(context) is not None and bool(current_boxes(context))
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        chart = bridge.present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
+        if not bridge.is_chart(chart):
+            return super().execute(context)
+        try:
+            self.deliver(context, *charts.save(chart, self.new_folder()))
+        except FAILURES as error:
+            return self._failed(error)
+        context.scene.gimp3d.reference = chart
+        self.tidy()
+        return {"FINISHED"}
 
     def start(self, context: bpy.types.Context) -> Worker:
         camera = _camera(context)

@@ -11,7 +11,7 @@ from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
 
-from .. import jobs, splats, steps
+from .. import charts, jobs, splats, steps
 from ..bridge import present
 from ..worker import Killed, Worker, duration
 from .base import RunsChild, current_boxes, current_splat, link, python_of
@@ -41,6 +41,7 @@ class RunsRemoval(RunsChild):
             raise
         result = bring_back(context, self.folder)
         jobs.close(self.folder)
+        charts.show(context, self.folder / "report" / "charts", result)
         settings, seconds, counts = context.scene.gimp3d, summary["seconds_total"], summary["counts"]
         if self._told and counts["added"] and not self.worker.compiled:
             settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever

@@ -16,7 +16,7 @@ from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras
 from gimp3d.orbit import measured_up, orbit_cameras
 
-from .. import backdrops, bridge, splats
+from .. import backdrops, bridge, charts, splats
 from .base import ReportsErrors, current_boxes, current_splat, link
 
 COLLECTION = "3D-GIMP views"
@@ -38,7 +38,7 @@ def add_cameras(
         link(context, obj, collection)
         photo = bridge.photo_of(obj)
         if backgrounds and photo is not None:
-            backdrops.put_behind(obj, photo)
+            backdrops.put_behind(obj, bpy.data.images.load(str(photo), check_existing=True))
     settings = context.scene.gimp3d
     settings.views, settings.view_collection, settings.splat = "COLLECTION", collection, splat
     if context.scene.camera is None and collection.objects:
@@ -146,7 +146,7 @@ class GIMP3D_OT_look_through(ReportsErrors, bpy.types.Operator):
         if not cameras:
             raise BadInput("no view to look through; add views (3D-GIMP panel, step 3)")
         if self.camera:
-            found = next((c for c in cameras if c.name == self.camera), None)
+            found = next((c for c in [*cameras, *charts.of_scene(scene)] if c.name == self.camera), None)
             if found is None:
                 raise BadInput(f"no view is called {self.camera}")
         else:

@@ -11,6 +11,7 @@ from scenes import cameras, scene
 
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply
+from gimp3d.job import load_job
 from gimp3d.pipeline import render_bytes
 from gimp3d.priors.inpaint import PROVIDERS
 from gimp3d_addon import properties
@@ -59,6 +60,33 @@ def test_a_picture_painted_elsewhere(splat: bpy.types.Object, tmp_path: Path) ->
     bpy.ops.gimp3d.load_reference(filepath=str(tmp_path / "painted.png"))
     bpy.ops.gimp3d.remove_object()
     assert share_of_green(tmp_path, mask) > 0.8
+
+
+def test_a_painted_chart_is_what_the_result_shows(splat: bpy.types.Object, tmp_path: Path) -> None:
+    bpy.ops.gimp3d.preview_masks()
+    mask = np.array(bpy.data.images["3D-GIMP mask"].pixels).reshape(90, 120, 4)[::-1, :, 0] > 0.5
+    bpy.ops.gimp3d.choose_reference(camera="chart:1")
+    assert bpy.ops.gimp3d.export_reference(filepath=str(tmp_path / "chart.png")) == {"FINISHED"}
+    hole = read_image(tmp_path / "chart.mask.png")[..., 0] > 127
+    painted = np.where(hole[..., None], np.array(GREEN, np.uint8), read_image(tmp_path / "chart.png"))
+    write_png(tmp_path / "painted.png", painted)
+    bpy.ops.gimp3d.load_reference(filepath=str(tmp_path / "painted.png"))
+    bpy.ops.gimp3d.remove_object()
+    job = load_job(next((tmp_path / "gimp3d_jobs").iterdir()))
+    assert job.reference == "chart:1" and read_image(Path(job.reference_image)).shape == painted.shape
+    assert share_of_green(tmp_path, mask) > 0.8
+    assert bpy.context.scene.gimp3d.reference.name == "chart:1"
+    bpy.ops.gimp3d.export_reference(filepath=str(tmp_path / "again.png"))  # as completed now
+    assert (np.abs(read_image(tmp_path / "again.png").astype(int) - GREEN)[hole].max(-1) < 10).mean() > 0.9
+
+
+def test_a_chart_is_painted_in_blender(splat: bpy.types.Object) -> None:
+    bpy.ops.gimp3d.preview_masks()
+    bpy.ops.gimp3d.choose_reference(camera="chart:1")
+    assert bpy.ops.gimp3d.paint_reference() == {"FINISHED"}
+    settings, chart = bpy.context.scene.gimp3d, bpy.data.images["3D-GIMP chart 1"]
+    assert settings.reference_paint == bpy.data.images["3D-GIMP reference"]
+    assert settings.reference_paint.size[:] == bpy.data.images["3D-GIMP mask"].size[:] == chart.size[:]
 
 
 def test_the_last_picture_given_counts(splat: bpy.types.Object, tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ class RecordingLayout:
         assert name in data.bl_rna.properties or data.path_resolve(name) is not None, name
         self.log.append(name)
 
-    def operator(self, name: str, **_: object) -> Options:
+    def operator(self, name: str, text: str = "", **_: object) -> Options:
         module, operator = name.split(".")
-        self.log.append(name)
+        self.log += [name, text]
         return Options(getattr(getattr(bpy.ops, module), operator).get_rna_type())
 
     def label(self, text: str = "", icon: str = "NONE", **_: object) -> None:
@@ -180,3 +180,11 @@ def test_every_property_and_operator_explains_itself(splat: bpy.types.Object) ->
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s"), (75, "75 s"), (200, "3 min"), (7200, "2.0 h")])
 def test_times_are_said_in_the_right_size(seconds: float, words: str) -> None:
     assert duration(seconds) == words
+
+
+def test_charts_are_offered_to_look_at(splat: bpy.types.Object, tmp_path: Path) -> None:
+    add_box()
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    assert "Look at chart:1" not in drawn()
+    bpy.ops.gimp3d.preview_masks()
+    assert "Look at chart:1" in drawn()

@@ -164,6 +164,7 @@ def test_previews_lie_over_the_camera_one_at_a_time(splat: bpy.types.Object, tmp
         bpy.ops.gimp3d.preview_masks()
         assert [s.image.name for s in slots] == ["000.png", "3D-GIMP hole"]
     assert bpy.context.scene.gimp3d.hole.endswith("pixels in orbit/000")
-    assert len([i for i in bpy.data.images if i.name.startswith("3D-GIMP")]) == 4  # view, mask, hole, surface
+    made = {i.name for i in bpy.data.images if i.name.startswith("3D-GIMP")}
+    assert made == {f"3D-GIMP {title}" for title in ("view", "mask", "hole", "surface", "chart 1", "chart 1 hole")}
     bpy.ops.gimp3d.hide_previews()
     assert [s.image.name for s in slots] == ["000.png"]

@@ -157,6 +157,62 @@ def test_a_given_picture_that_matches_poorly_is_a_warning(scene_folder: Path, tm
     assert len(warnings) == 1 and "agrees by 0." in warnings[0]
 
 
+@pytest.fixture(scope="module")
+def completed(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """charts/ of a removal, and its summary."""
+    folder = tmp_path_factory.mktemp("completed")
+    remove(scene_folder, folder / "out.ply", "--views-out", str(folder), "--summary", str(folder / "s.json"))
+    return folder
+
+
+def test_charts_are_written_for_painting(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
+    """Before the removal and by it they are the same but for the fill."""
+    arguments = [str(scene_folder / "scene.ply"), "--cameras", str(scene_folder / "transforms.json")]
+    arguments += ["--roi", str(scene_folder / "roi.json"), "--out", str(tmp_path / "masks"), "--progress", "none"]
+    assert main(["masks", *arguments, "--pictures", str(tmp_path), "--frames", "orbit/004"]) == 0
+    before, after = tmp_path / "charts", completed / "charts"
+    assert {p.name for p in before.iterdir()} == {p.name for p in after.iterdir()}
+    for name in ("transforms.json", "1.hole.png"):
+        assert (before / name).read_bytes() == (after / name).read_bytes(), name
+    hole = read_image(before / "1.hole.png")[..., 0] > 127
+    facts = json.loads((completed / "s.json").read_text())["charts"]
+    assert len(facts) == 1 and facts[0]["hole_texels"] == hole.sum() > 0
+    pictures = [read_image(f / "1.png") for f in (before, after)]
+    np.testing.assert_array_equal(pictures[0][~hole], pictures[1][~hole])
+    assert (pictures[0] != pictures[1]).any()
+    cameras_ = ["--cameras", str(after / "transforms.json"), "--out", str(tmp_path / "seen"), "--progress", "none"]
+    assert main(["render", str(completed / "out.ply"), *cameras_]) == 0
+    drawn = read_image(tmp_path / "seen" / "1.png").astype(float)
+    assert np.abs(drawn - pictures[1])[hole].mean() < 12  # the cameras are those of the pictures
+
+
+def test_a_painted_chart_rules_its_hole(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
+    hole = read_image(completed / "charts" / "1.hole.png")[..., 0] > 127
+    painted = np.where(hole[..., None], np.uint8((20, 200, 40)), read_image(completed / "charts" / "1.png"))
+    write_png(tmp_path / "painted.png", painted)
+    given = ("--reference", "chart:1", "--reference-image", str(tmp_path / "painted.png"))
+    job = ("--job", str(tmp_path / "job"), "--summary", str(tmp_path / "s.json"), "--report", str(tmp_path / "report"))
+    remove(scene_folder, tmp_path / "out.ply", *given, *job, "--views-out", str(tmp_path))
+    np.testing.assert_array_equal(read_image(tmp_path / "charts" / "1.png"), painted)
+    summary = json.loads((tmp_path / "s.json").read_text())
+    assert not summary["warnings"]
+    assert "picture pasted as it is" in next(s["reason"] for s in summary["stages"] if s["name"] == "appearance")
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "<td>chart:1</td>" in page
+    np.testing.assert_array_equal(read_image(tmp_path / "report" / "charts" / "1.png"), painted)
+    assert (read_image(tmp_path / "report" / "chart_1.png")[hole][:, 0] > 100).all()  # the hole is marked in red
+    filled = read_ply(tmp_path / "out.ply").gaussians
+    green = [render_bytes(filled, c).astype(int) @ [-1, 2, -1] > 120 for c in cameras()]
+    bare = [
+        render_bytes(read_ply(completed / "out.ply").gaussians, c).astype(int) @ [-1, 2, -1] > 120 for c in cameras()
+    ]
+    assert min(g.sum() for g in green) > 100 and not np.any(bare)
+    first = (tmp_path / "out.ply").read_bytes()
+    (tmp_path / "out.ply").unlink()
+    assert main(["remove", "--job", str(tmp_path / "job"), "--progress", "none"]) == 0
+    assert (tmp_path / "out.ply").read_bytes() == first
+
+
 def test_extra_masks_are_filled_too(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = cameras()[4]
     shadow = np.zeros((camera.height, camera.width), bool)
@@ -307,6 +363,18 @@ BAD = {
     "orthographic": (["remove", "scene.ply", "--cameras", "ortho.json", "--roi", "roi.json"], 2, "orthographic"),
     "climbing ID": (["remove", "scene.ply", "--cameras", "climb.json", "--roi", "roi.json"], 2, "leads out"),
     "unknown reference": (f"{REMOVE} --reference x".split(), 2, "no camera x"),
+    "unknown chart": (f"{REMOVE} --reference chart:9".split(), 2, "there is 1 chart, chart:1"),
+    "no chart zero": (f"{REMOVE} --reference chart:0".split(), 2, "there is 1 chart, chart:1"),
+    "chart of a preset without": (f"{REMOVE} --reference chart:1 --preset paper".split(), 2, "photos are the only"),
+    "chart where none is found": (
+        f"{REMOVE} --reference chart:1 --set charts.least=2".split(), 2, "no chart is found here; name a view",
+    ),
+    "picture of another surface than the chart's": (
+        [*f"{REMOVE} --reference chart:1".split(), "--reference-image", "square.png"], 2, "does not match",
+    ),
+    "picture of another shape than the chart's": (
+        [*f"{REMOVE} --reference chart:1".split(), "--reference-image", "wide.png"], 2, "shape",
+    ),
     "picture of another view": (
         [*f"{REMOVE} --reference orbit/000".split(), "--reference-image", "noise.png"], 2, "does not match",
     ),
@@ -370,6 +438,7 @@ def bad_folder(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     noise = np.random.default_rng(0).integers(0, 255, (90, 120, 3), dtype=np.uint8)
     write_png(folder / "noise.png", noise)
     write_png(folder / "square.png", noise[:, :90])
+    write_png(folder / "wide.png", noise[:30])
     return folder
 
 

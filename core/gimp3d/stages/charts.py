@@ -6,6 +6,7 @@ A chart's picture is made of all photos with the object left out; what no photo 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,12 @@ PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound ea
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
+
+
+def chart_number(reference: str | None) -> int | None:
+    """N of the reference chart:N, counted from 1; None for a view's ID."""
+    found = re.fullmatch(rf"{CHART}:(\d+)", reference or "")
+    return int(found[1]) if found else None
 
 
 @dataclass(frozen=True)
