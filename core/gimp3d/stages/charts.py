@@ -369,10 +369,10 @@ def _chart(
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
     hole &= there
-    image, common, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
+    image, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
     photos = (said == Says.SEEN).sum(0).astype(np.uint16)
     beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
-    alike = _alike(common, spread, there & (photos > 1) & ~hole)
+    alike = _alike(spread, there & (photos > 1) & ~hole)
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & ((said == Says.HIDDEN).sum(0) > photos)
     return Chart(
@@ -393,16 +393,14 @@ def _chart(
     )
 
 
-def _alike(common: np.ndarray, spread: np.ndarray, told: np.ndarray) -> np.ndarray:
+def _alike(spread: np.ndarray, told: np.ndarray) -> np.ndarray:
     """[H, W] bool: texels of which photos tell much the same: things that stand on the surface smear over it.
 
-    Misplaced photos differ too where there is texture, but by less than what they have in common; and a quarter of
-    what several photos show is taken for the surface itself.
+    A quarter of what several photos show is taken for the surface itself.
     """
     if not told.any():
         return np.ones(told.shape, bool)
-    limit = max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread[told], 25)))
-    return spread <= np.maximum(common, limit)
+    return spread <= max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread[told], 25)))
 
 
 def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:

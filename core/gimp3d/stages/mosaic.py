@@ -22,12 +22,11 @@ def mosaic(
     normal: np.ndarray,  # [3] unit
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:
     """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
 
-    And what photos' textures have in common round each texel, and by how much they differ from that, [H, W] float32
-    grey levels each, medians over photos: light differs between photos on any surface, but things that do not lie on
-    it also show another texture in each.
+    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: light
+    differs between photos on any surface, but things that do not lie on it also show another texture in each.
 
     Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
     decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time: the one
@@ -53,15 +52,14 @@ def mosaic(
     parts = parallel_map(of, range(len(witnesses)))
     samples, textures, density = (np.array([p[k] for p in parts]) for k in range(3))
     common, best = np.zeros((2, h * w, 3), np.float32)
-    alike, spread = np.zeros((2, h * w), np.float32)
-    run_ranges(_choose_range, h * w, samples, textures, density, FEW, common, best, alike, spread)
+    spread = np.zeros(h * w, np.float32)
+    run_ranges(_choose_range, h * w, samples, textures, density, FEW, common, best, spread)
     common, best = common.reshape(h, w, 3), best.reshape(h, w, 3)
     shown = (density > 0).any(0).reshape(h, w)
     detail = best - _smooth(best, shown)
     picture = np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0)
     several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
-    alike, spread = (_smooth(a.reshape(h, w, 1), several)[..., 0] for a in (alike, spread))
-    return picture.astype(np.uint8), alike, spread
+    return picture.astype(np.uint8), _smooth(spread.reshape(h, w, 1), several)[..., 0]
 
 
 def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -71,7 +69,7 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 @exact_kernel
-def _choose_range(lo, hi, samples, textures, density, few, common, best, alike, spread):
+def _choose_range(lo, hi, samples, textures, density, few, common, best, spread):
     views = len(samples)
     values = np.empty(views)
     for i in range(lo, hi):
@@ -93,7 +91,6 @@ def _choose_range(lo, hi, samples, textures, density, few, common, best, alike, 
                 values[count] = textures[k, i]
                 count += 1
         part = np.sort(values[:count])
-        alike[i] = 0.5 * abs(part[count // 2])
         spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
         off, least, largest = 0.0, 1e9, 0.0
         for k in range(views):  # the nearest to the median always agrees
