@@ -58,6 +58,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
+from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
 from .threads import parallel_map
 
@@ -155,6 +156,7 @@ class RemovalResult:
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
+    verdict: Verdict | None = None  # None where nothing was removed
 
 
 class Store(Protocol):
@@ -171,6 +173,7 @@ class View:
 
     camera: Camera
     image: np.ndarray  # [H, W, 3] uint8
+    is_photo: bool = True  # False: drawn from the scene
 
 
 class _Run:
@@ -249,13 +252,20 @@ def remove_object(
             masks = replace(masks, selection=charted.selection, views=open_views)
     keep = ~masks.removed
     kept = scene.take(keep)
+
+    def judged(added: Gaussians | None, left: Sequence[ViewMasks], given: Reference | None) -> Verdict:
+        seen = {v.camera.id for v in views if v.is_photo}
+        still_open = [v.target for v in left]
+        return judge(scene, keep, added, masks.views, still_open, levelled, seen, charts, hits, given)
+
     for v in _spread(open_views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if masks.hole_pixels == 0:
         why = "nothing to fill: every view sees what is behind the object"
         if masks.mode == "paper":
             why = "nothing to fill: what surrounds the box covers its outline in every view"
-        return _finish(run, keep, None, masks, charts, {}, [why])
+        verdict = judged(None, masks.views, None)
+        return replace(_finish(run, keep, None, masks, charts, {}, [why]), verdict=verdict)
 
     def emptied(v: ViewMasks) -> np.ndarray:
         """A view's photo with the emptied scene in the object's place."""
@@ -322,6 +332,8 @@ def remove_object(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
 
+    verdict = judged(added, open_views, done[0] if done and reference_image is not None else None)
+
     def finish(v: ViewMasks) -> None:
         name = v.camera.id
         painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
@@ -329,7 +341,7 @@ def remove_object(
     parallel_map(finish, masks.views)
     pictures = {r.camera.id: r.image for r in done}
     charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in charts)
-    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left)
+    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left, verdict=verdict)
 
 
 def _exposures(scene: Gaussians, masks: Masks, photos: Mapping[str, np.ndarray]) -> dict[str, Exposure]:
