@@ -332,7 +332,7 @@ def _load_views(cameras: Sequence[Camera], job: RemovalJob, file: SplatFile) -> 
             image, pinhole = load_view(camera)
             return View(pinhole, image), False
         pinhole = undistorted(camera)
-        return View(pinhole, render_bytes(file.gaussians, pinhole)), wanted
+        return View(pinhole, render_bytes(file.gaussians, pinhole), is_photo=False), wanted
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
@@ -383,6 +383,7 @@ def _summary(
             "hole_pixels": result.hole_pixels,
             "open_pixels": result.open_pixels,
         },
+        "verdict": asdict(result.verdict) if result.verdict else None,
         "selection": result.selection,
         "charts": [
             {

@@ -253,10 +253,14 @@ def remove_object(
     keep = ~masks.removed
     kept = scene.take(keep)
 
-    def judged(added: Gaussians | None, left: Sequence[ViewMasks], given: Reference | None) -> Verdict:
+    def judged(added: Gaussians | None, left: Sequence[ViewMasks], given: Reference | None) -> Verdict | None:
         seen = {v.camera.id for v in views if v.is_photo}
         still_open = [v.target for v in left]
-        return judge(scene, keep, added, masks.views, still_open, levelled, seen, charts, hits, given)
+        return run(
+            "verdict",
+            lambda: judge(scene, keep, added, masks.views, still_open, levelled, seen, charts, hits, given),
+            lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
+        )
 
     for v in _spread(open_views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
@@ -920,4 +924,5 @@ STORED = (
     PaintedView,
     Appearance,
     Refinement,
+    Verdict,
 )

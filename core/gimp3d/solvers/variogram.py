@@ -55,7 +55,7 @@ def variogram(
 
 def at_lag(lags: list[tuple[float, float]], distance: np.ndarray) -> np.ndarray:
     """The variogram between its lags and beyond."""
-    return np.interp(distance, *zip(*lags))
+    return np.interp(distance, [lag for lag, _ in lags], [value for _, value in lags])
 
 
 def carried(

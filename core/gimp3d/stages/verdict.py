@@ -1,15 +1,15 @@
 """How good a removal probably is, told without the truth.
 
-Where the object was, a pixel's true colour is what photos show of the surface there, or a picture that was given. Where
-none does, all that is known is what the rim lets expect: its colours, carried inwards, and how far apart its own colours
-are at such a distance. From both follows the squared error to be expected of whatever is drawn: a fill, mud, haze, rests
-of the object or an open hole. The score compares it with the error of the surroundings before the removal.
+Where the object was, a pixel's true colour is what photos, or a picture that was given, show of the surface there.
+Where none does, all that is known is what the rim lets expect: its colours carried inwards, and how far apart they are
+at such a distance. From both follows the squared error to be expected of whatever is drawn: a fill, mud, haze, rests of
+the object, an open hole. The score compares it with the error of the surroundings before the removal.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -91,6 +91,11 @@ class _Sample:
     given: np.ndarray  # bool, by the given picture
     points: np.ndarray
 
+    @property
+    def unseen(self) -> np.ndarray:
+        """Pixels of the object whose colours nothing tells."""
+        return self.object & ~self.told & ~self.given
+
 
 def judge(
     scene: Gaussians,
@@ -104,23 +109,24 @@ def judge(
     hits: Mapping[str, Hits] | None = None,  # by ID
     given: Reference | None = None,  # that a picture was given for
     settings: VerdictSettings = VerdictSettings(),
-) -> Verdict:
-    """What a few views, drawn near the object, tell of a removal."""
+) -> Verdict | None:
+    """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
     kept = scene.take(keep)
     final = kept if added is None else kept.extended(added)
     asked = [v for v in views if v.camera.id in photographed] or list(views)
     witnesses = [_witness(v.camera, photos[v.camera.id], v.silhouette, v.depth_before) for v in asked]
     floats, unsure = _floating(final, charts, witnesses), [_height_doubt(c) for c in charts]
     showing = [v for v in asked if v.silhouette.any()]
+    if not showing:
+        return None
     count = min(settings.views, len(showing))
 
     def look(view: ViewMasks) -> _Look:
         photo = photos[view.camera.id].astype(np.float32)
         away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
         near, around = away <= settings.ring, away > EDGE
-        nearest = np.partition(away[around], min(view.silhouette.sum(), around.sum() - 1)) if around.any() else [0]
-        alike = around & (away <= nearest[min(view.silhouette.sum(), around.sum() - 1)])
-        before = _drawn(scene, view.camera, (near & around) | alike)
+        beside = around & (away <= _reach(away[around], int(view.silhouette.sum())))
+        before = _drawn(scene, view.camera, (near & around) | beside)
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
         chart, off = np.zeros((2, *near.shape), np.float32)
         met = (hits or {}).get(view.camera.id)
@@ -139,7 +145,7 @@ def judge(
             chart,
             off,
             weights.footprint(floats),
-            float(((before - photo)[alike] ** 2).mean()) if alike.any() else 0.0,
+            _mean([_squared(before, photo)[beside]]),
         )
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
@@ -158,52 +164,71 @@ def _summed(
     with_photos: bool,
     with_charts: bool,
 ) -> Verdict:
-    def mean(values: Sequence[np.ndarray]) -> float:
-        return (
-            float(np.concatenate([v.ravel() for v in values]).mean(dtype=np.float64))
-            if any(map(np.size, values))
-            else 0.0
-        )
-
-    misses = [_squared(s.after, s.expected) for s in samples]
-    usual = [_squared(s.before, s.expected)[s.ring] for s in samples]
-    photo = [s.object & s.told for s in samples]
-    picture = [s.object & s.given for s in samples]
-    unseen = [s.object & ~s.told & ~s.given for s in samples]
-    objects = sum(int(s.object.sum()) for s in samples)
-    share = {"photo": _count(photo) / objects, "picture": _count(picture) / objects, "unseen": _count(unseen) / objects}
-    # other photos never show quite what a view sees: what they miss round the object, where all is known, is no fault
-    wrong = share["photo"] * max(0.0, mean([m[p] for m, p in zip(misses, photo)]) - mean(usual))
-    wrong += sum(
-        share[name] * mean([(m + s.variance)[p] for m, s, p in zip(misses, samples, where)])
-        for name, where in (("picture", picture), ("unseen", unseen))
-    )
-    error = max(LEAST_ERROR, mean([np.array(look.error) for look in looks])) if with_photos else USUAL_ERROR
-    decibels = 10 * math.log10(1 + wrong / error)
-    limit = max(float(np.percentile(np.concatenate(usual), 95)) if any(map(np.size, usual)) else 0.0, LEAST_ERROR)
-    alike = [m[p] <= limit for m, p in zip(misses, photo)] + _views_agree(looks, samples, unseen, limit)
-    before, after = (
-        mean([((picture - look.photo) ** 2)[look.ring] for look, picture in zip(looks, pictures)])
-        for pictures in ([x.before for x in looks], [x.after for x in looks])
-    )
     hole = sum(int(v.target.sum()) for v in views)
+    objects = _count(s.object for s in samples)
+    error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
+    added = _added_error(samples)
+    before = _mean(_squared(look.before, look.photo)[look.ring] for look in looks)
+    after = _mean(_squared(look.after, look.photo)[look.ring] for look in looks)
+    alike = _alike(looks, samples)
     verdict = Verdict(
-        score=1 / (1 + wrong / (HALF * error)),
+        score=1 / (1 + added / (HALF * error)),
         open_share=_count(still_open) / max(1, hole),
-        remains=sum(_like_object(s) for s in samples) / objects,
-        haze=mean([look.haze[look.view.silhouette] for look in looks]) if with_charts else None,
+        remains=_count(map(_like_object, samples)) / objects,
+        haze=_mean(look.haze[look.view.silhouette] for look in looks) if with_charts else None,
         ring_fidelity=10 * math.log10(max(before, LEAST_ERROR) / max(after, LEAST_ERROR)) if with_photos else None,
         sharpness=_sharpness(looks),
-        agreement=mean(alike) if with_photos and any(map(np.size, alike)) else None,
-        invented=share["unseen"],
-        expected_error=decibels,
+        agreement=float(alike.mean()) if with_photos and len(alike) else None,
+        invented=_count(s.unseen for s in samples) / objects,
+        expected_error=10 * math.log10(1 + added / error),
         words=(),
     )
     return replace(verdict, words=_words(verdict))
 
 
+def _added_error(samples: Sequence[_Sample]) -> float:
+    """The mean squared error to be expected of the object's pixels beyond that of the scene itself, grey levels²."""
+    photo, picture = [s.object & s.told for s in samples], [s.object & s.given for s in samples]
+    unseen = [s.unseen for s in samples]
+
+    def missed(where: Sequence[np.ndarray]) -> float:
+        return _mean(_squared(s.after, s.expected)[w] for s, w in zip(samples, where))
+
+    def unknown(where: Sequence[np.ndarray]) -> float:
+        return _mean(s.variance[w] for s, w in zip(samples, where))
+
+    usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
+    # Photos never show quite what other views see: by as much as they miss round the object, nothing is wrong.
+    # A fill differs from what is expected as texture does; the truth does so as well, however little the fill.
+    errors = (max(0.0, missed(photo) - usual), missed(picture) + unknown(picture), max(missed(unseen), unknown(unseen)))
+    pixels = [_count(where) for where in (photo, picture, unseen)]
+    return float(np.average(errors, weights=pixels))
+
+
+def _alike(looks: Sequence[_Look], samples: Sequence[_Sample]) -> np.ndarray:
+    """[N] bool: pixels of the object that differ from photos, else from other views, as is usual round it."""
+    usual = np.concatenate([_squared(s.before, s.expected)[s.ring] for s in samples])
+    limit = max(LEAST_ERROR, float(np.percentile(usual, 95)) if len(usual) else 0.0)
+    drawn = [
+        _witness(look.view.camera, np.rint(look.after).astype(np.uint8), np.zeros(look.depth.shape, bool), look.depth)
+        for look in looks
+    ]
+    found = []
+    for k, sample in enumerate(samples):
+        found.append(_squared(sample.after, sample.expected)[sample.object & sample.told] <= limit)
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME)
+        found.append((_squared(sample.after[sample.unseen], colours) <= limit)[seen])
+    return np.concatenate(found)
+
+
 def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.ndarray) -> Witness:
     return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
+
+
+def _reach(away: np.ndarray, count: int) -> float:
+    """The distance within which so many of the pixels [N] lie."""
+    k = min(count, len(away)) - 1
+    return float(np.partition(away, k)[k]) if k >= 0 else 0.0
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -211,30 +236,21 @@ def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(((a - b) ** 2).mean(-1))
 
 
-def _count(masks: Sequence[np.ndarray]) -> int:
+def _mean(parts: Iterable[np.ndarray]) -> float:
+    """Of all numbers in the arrays; 0 of none."""
+    all_ = np.concatenate(list(parts))
+    return float(all_.mean(dtype=np.float64)) if len(all_) else 0.0
+
+
+def _count(masks: Iterable[np.ndarray]) -> int:
     return sum(int(m.sum()) for m in masks)
 
 
-def _like_object(sample: _Sample) -> int:
-    """How many pixels are drawn more like the photo with the object than like what is expected without it."""
+def _like_object(sample: _Sample) -> np.ndarray:
+    """[h, w] bool: drawn more like the photo with the object than like what is expected without it."""
     change, made = sample.photo - sample.expected, sample.after - sample.expected
     along = cv2.blur((made * change).sum(-1), (3, 3)) > 0.5 * cv2.blur((change**2).sum(-1), (3, 3))
-    return int((sample.object & along & (_squared(sample.photo, sample.expected) > UNLIKE**2)).sum())
-
-
-def _views_agree(
-    looks: Sequence[_Look], samples: Sequence[_Sample], where: Sequence[np.ndarray], limit: float
-) -> list[np.ndarray]:
-    """Whether places are drawn as other views draw them, [N] bool for each sample; places in one view do not count."""
-    drawn = [
-        _witness(look.view.camera, np.rint(look.after).astype(np.uint8), np.zeros(look.depth.shape, bool), look.depth)
-        for look in looks
-    ]
-    found = []
-    for k, (sample, pixels) in enumerate(zip(samples, where)):
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[pixels], SAME)
-        found.append((_squared(sample.after[pixels], colours) <= limit)[seen])
-    return found
+    return sample.object & along & (_squared(sample.photo, sample.expected) > UNLIKE**2)
 
 
 def _sharpness(looks: Sequence[_Look]) -> float | None:
@@ -260,15 +276,17 @@ def _sampled(
     object_, ring, photo, depth, chart = (
         a[thin] for a in (look.view.silhouette, look.ring, look.photo, look.depth, look.chart)
     )
-    # a chart is what is behind the object, unless something else that is drawn stands before it or, beside it, behind
-    off = np.abs(depth - chart) > tolerance * chart
-    on_chart = (chart > 0) & ~(off & ring) & ~(off & (depth > 0) & (depth < chart))
-    surface = np.where(on_chart, chart, depth)
-    points = camera.unproject(camera.pixel_centres()[thin], surface.astype(np.float64))
+    others = [w for w in witnesses if w.camera.id != camera.id]
+    centres = camera.pixel_centres()[thin]
+    # charts are what was behind the object, unless photos show what is drawn before them
+    standing = object_ & (depth > 0) & (depth < (1 - tolerance) * chart)
+    standing[standing] = shown(others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME)[1]
+    off_chart = (chart == 0) | standing | (ring & (np.abs(depth - chart) > tolerance * chart))
+    surface = np.where(off_chart, depth, chart)
+    points = camera.unproject(centres, surface.astype(np.float64))
     asked = (object_ | ring) & (surface > 0)
     told, by_picture = np.zeros((2, *asked.shape), bool)
     expected = photo.copy()
-    others = [w for w in witnesses if w.camera.id != camera.id]
     colours, told[asked] = shown(others, points[asked], SAME, tolerance)
     expected[told] = colours[told[asked]]
     if given is not None:
@@ -293,9 +311,8 @@ def shown(
     farther: float | None = None,  # by which it may be farther; None: as much
 ) -> tuple[np.ndarray, np.ndarray]:
     """The median colour of the views that show a point [N, 3] float32, 0 of none; and whether any does [N]."""
-    seen = (ask(witnesses, points, farther or tolerance) == Says.SEEN) & (
-        ask(witnesses, points, tolerance) != Says.BEHIND
-    )
+    seen = ask(witnesses, points, farther or tolerance) == Says.SEEN
+    seen &= ask(witnesses, points, tolerance) != Says.BEHIND
     colours = np.full((len(witnesses), len(points), 3), np.nan, np.float32)
     for k, witness in enumerate(witnesses):
         colours[k, seen[k]] = _colours(witness.photo, witness.camera, points[seen[k]])
@@ -359,42 +376,40 @@ def _drawn(gaussians: Gaussians, camera: Camera, pixels: np.ndarray) -> np.ndarr
     return np.clip(255 * rgb, 0, 255).astype(np.float32)
 
 
-def _words(verdict: Verdict) -> tuple[str, ...]:
-    """What it comes to, and what to do about each thing that is amiss."""
-    v = verdict
-    times = 10 ** (v.expected_error / 20)
+def _words(v: Verdict) -> tuple[str, ...]:
+    """What it comes to; then, of each thing that is amiss, how much, and what to do."""
     level = "good" if v.score >= GOOD else "fair" if v.score >= FAIR else "poor"
-    words = [f"{level}: where the object was, errors are probably {times:.1f} times those of its surroundings"]
-    if v.open_share > 0.02:
-        words.append(
-            f"{v.open_share:.0%} of the hole is open: add views that look at it from other sides, or take the preset best"
-        )
-    if v.remains > 0.05:
-        words.append(
-            f"{v.remains:.0%} of the object's place still looks like it: enlarge the box until it holds all of the object"
-        )
-    if v.haze is not None and v.haze > 0.05:
-        words.append(
-            f"haze covers {v.haze:.0%} of what was behind the object: enlarge the box, or add a box round the haze"
-        )
-    if v.ring_fidelity is not None and v.ring_fidelity < -0.5:
-        words.append(
-            f"the surroundings lost {-v.ring_fidelity:.1f} dB against the photos: make the box fit the object more tightly"
-        )
-    if v.sharpness is not None and v.sharpness < 0.5:
-        words.append(
-            f"the fill has {v.sharpness:.0%} of its surroundings' detail: give a painted picture of one view, or take the preset best"
-        )
-    if v.sharpness is not None and v.sharpness > 2:
-        words.append(
-            f"the fill has {v.sharpness:.1f} times its surroundings' detail: try another seed, or give a painted picture of one view"
-        )
-    if v.agreement is not None and v.agreement < 0.6:
-        words.append(
-            f"{1 - v.agreement:.0%} of the object's place looks other than photos show it: mark its shadow or reflection, if it has one"
-        )
-    if v.invented > 0.3:
-        words.append(
-            f"{v.invented:.0%} of the object's place was seen by no photo: look at it, and paint one view if it does not convince"
-        )
-    return tuple(words)
+    times = 10 ** (v.expected_error / 20)
+    detail = 1.0 if v.sharpness is None else v.sharpness
+    amiss = (
+        (
+            v.open_share > 0.02,
+            f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best",
+        ),
+        (
+            v.remains > 0.05,
+            f"{v.remains:.0%} of the object's place still looks like it: enlarge the box until all of it is inside",
+        ),
+        (
+            (v.haze or 0) > 0.05,
+            f"haze covers {v.haze or 0:.0%} of what was behind the object: enlarge the box, or add one round the haze",
+        ),
+        (
+            (v.ring_fidelity or 0) < -0.5,
+            f"the surroundings lost {-(v.ring_fidelity or 0):.1f} dB against the photos: make the box tighter",
+        ),
+        (
+            not 0.5 < detail < 2,
+            f"the fill has {detail:.1f} times the detail of its surroundings: paint one view, or try another seed",
+        ),
+        (
+            v.agreement is not None and v.agreement < 0.7,
+            f"only {v.agreement or 0:.0%} of the object's place looks as photos show it: mark shadows and reflections",
+        ),
+        (
+            v.invented > 0.3,
+            f"no photo shows {v.invented:.0%} of the object's place: paint one view if the fill does not convince",
+        ),
+    )
+    first = f"{level}: errors where the object was are probably {times:.1f} times those round it"
+    return (first, *(words for wrong, words in amiss if wrong))
