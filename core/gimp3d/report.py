@@ -234,7 +234,7 @@ def _page(
         f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"
         f"<p>{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
         f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>"
-        f"{_verdict(summary['verdict'])}{warnings}"
+        f"{_verdict(summary.get('verdict'))}{warnings}"
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"{_flip_book(flips)}"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"

@@ -65,14 +65,13 @@ def carried(
     """Known colours, and coarser means of them where there are none (push-pull: Grossman 1998); float32."""
     weight = known.astype(np.float32)
     levels = [(picture * weight[..., None], weight)]
-    while min(levels[-1][1].shape) > 1:
-        total, weight = levels[-1]
-        levels.append((cv2.pyrDown(total), cv2.pyrDown(weight)))
-    mean = picture[known].mean(0) if known.any() else np.zeros(3, np.float32)
+    while max(levels[-1][1].shape) > 1:
+        half = [-(-side // 2) for side in levels[-1][1].shape[::-1]]
+        levels.append(tuple(cv2.resize(a, half, interpolation=cv2.INTER_AREA) for a in levels[-1]))
     total, weight = levels.pop()
-    colour = (total + 1e-6 * mean) / (weight + 1e-6)[..., None]
+    colour = total / max(1e-9, float(weight[0, 0]))
     for total, weight in reversed(levels):
-        coarse = cv2.pyrUp(colour, dstsize=weight.shape[::-1])
-        own = np.minimum(weight, 1)[..., None]
-        colour = own * total / np.maximum(weight, 1e-9)[..., None] + (1 - own) * coarse
+        coarse = cv2.resize(colour, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        own = weight[..., None]
+        colour = total + (1 - own) * coarse
     return colour
