@@ -27,6 +27,7 @@ from .witness import Says, Witness, ask
 
 SAME = 0.02  # relative z within which two views show one surface
 EDGE = 3  # px next to the object that are mixed
+SCATTER = 4.0  # median distances of the drawn surface from a chart, from which something is before the chart
 UNLIKE = 24.0  # grey levels from which the object differs from what is behind it
 USUAL_ERROR = 65.0  # squared grey levels by which scenes miss photos, where there are none (30 dB)
 LEAST_ERROR = 1.0  # of 8-bit pictures
@@ -360,7 +361,7 @@ def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence
         with np.errstate(invalid="ignore"):
             framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
         cols, rows = uv[framed].astype(int).T
-        nearer = z[framed] < (1 - chart.tolerance) * chart.depth[rows, cols]
+        nearer = z[framed] < chart.depth[rows, cols] - SCATTER * chart.noise
         before[framed] |= chart.there[rows, cols] & nearer
         other[framed] |= chart.there[rows, cols] & ~nearer
     rows = np.flatnonzero(before & ~other & gaussians.usable)
