@@ -199,9 +199,13 @@ def _added_error(samples: Sequence[_Sample]) -> float:
         return _mean(s.variance[w] for s, w in zip(samples, where))
 
     usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
-    # Photos never show quite what other views see: by as much as they miss round the object, nothing is wrong.
-    # A fill differs from what is expected as texture does; the truth does so as well, however little the fill.
-    errors = (max(0.0, missed(photo) - usual), missed(picture) + unknown(picture), max(missed(unseen), unknown(unseen)))
+    # What other views show is off by `usual`: it is no error where a place is compared with them, but one where what they
+    # let expect is all there is. There the truth differs as texture does, however little the fill.
+    errors = (
+        max(0.0, missed(photo) - usual),
+        max(0.0, missed(picture) - usual) + unknown(picture),
+        max(missed(unseen), unknown(unseen)) + usual,
+    )
     pixels = [_count(where) for where in (photo, picture, unseen)]
     return float(np.average(errors, weights=pixels))
 
