@@ -199,8 +199,8 @@ def _added_error(samples: Sequence[_Sample]) -> float:
         return _mean(s.variance[w] for s, w in zip(samples, where))
 
     usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
-    # What other views show is off by `usual`: it is no error where a place is compared with them, but one where what they
-    # let expect is all there is. There the truth differs as texture does, however little the fill.
+    # What other views show is off by `usual`: no error where a place is compared with them, but one where nothing shows
+    # it and the fill is made of what they show elsewhere. The truth differs from that as texture does, besides.
     errors = (
         max(0.0, missed(photo) - usual),
         max(0.0, missed(picture) - usual) + unknown(picture),
