@@ -199,12 +199,12 @@ def _added_error(samples: Sequence[_Sample]) -> float:
         return _mean(s.variance[w] for s, w in zip(samples, where))
 
     usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
-    # What other views show is off by `usual`: no error where a place is compared with them, but one where nothing shows
-    # it and the fill is made of what they show elsewhere. The truth differs from that as texture does, besides.
+    # What other views show differs from what this one sees: by as much as it does round the object, nothing is wrong.
+    # Where nothing shows a place, the truth differs from what is expected as texture does, however little the fill.
     errors = (
         max(0.0, missed(photo) - usual),
         max(0.0, missed(picture) - usual) + unknown(picture),
-        max(missed(unseen), unknown(unseen)) + usual,
+        max(missed(unseen), unknown(unseen)),
     )
     pixels = [_count(where) for where in (photo, picture, unseen)]
     return float(np.average(errors, weights=pixels))
