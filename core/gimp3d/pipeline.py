@@ -336,7 +336,8 @@ def remove_object(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
 
-    verdict = judged(added, open_views, done[0] if done and reference_image is not None else None)
+    by_picture = reference_image is not None or settings.inpaint.startswith("file:")
+    verdict = judged(added, open_views, done[0] if done and by_picture else None)
 
     def finish(v: ViewMasks) -> None:
         name = v.camera.id
