@@ -188,6 +188,10 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
             row = layout.row(align=True)
             row.operator("gimp3d.compare", icon="ARROW_LEFTRIGHT")
             row.operator("gimp3d.restore", icon="LOOP_BACK")
+            if settings.verdict:
+                layout.progress(factor=settings.score, text=f"Score {settings.score:.2f}")
+                for words in settings.verdict.split("\n"):
+                    say(layout, words, "INFO")
         if settings.last_report:
             opened = layout.operator("wm.url_open", text="Open Report", icon="URL")
             opened.url = Path(bpy.path.abspath(settings.last_report)).as_uri()

@@ -94,6 +94,8 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         description="The last run's time over its forecast: later forecasts are multiplied by it",
     )
     hole: StringProperty(name="Hole", description="Size of what was or will be filled, as last measured")
+    score: FloatProperty(name="Score", description="How good the last removal probably is: 0 bad, 1 good")
+    verdict: StringProperty(name="Verdict", description="What the score comes to, and what to do; one sentence a line")
     last_job: StringProperty(name="Job", subtype="FILE_PATH", description="Folder of the last removal")
     last_report: StringProperty(
         name="Report", subtype="FILE_PATH", description="What each stage of the last removal did, as a web page"

@@ -277,6 +277,8 @@ def _remove(given: Namespace, shown: Reporter) -> None:
             f"removed {counts['removed']} and added {counts['added']} Gaussians in "
             f"{time.perf_counter() - start:.1f} s: {job.out}"
         )
+        if summary["verdict"]:
+            print(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}")
     if given.progress != "json":
         for warning in summary["warnings"]:
             print(f"gimp3d: warning: {warning}", file=sys.stderr)

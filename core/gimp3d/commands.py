@@ -326,7 +326,7 @@ def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians)
             image, pinhole = load_view(camera)
             return View(pinhole, image), False
         pinhole = undistorted(camera)
-        return View(pinhole, render_bytes(scene, pinhole)), wanted
+        return View(pinhole, render_bytes(scene, pinhole), is_photo=False), wanted
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
@@ -377,6 +377,7 @@ def _summary(
             "hole_pixels": result.hole_pixels,
             "open_pixels": result.open_pixels,
         },
+        "verdict": asdict(result.verdict) if result.verdict else None,
         "selection": result.selection,
         "charts": [
             {

@@ -58,6 +58,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
+from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
 from .threads import parallel_map
 
@@ -156,6 +157,7 @@ class RemovalResult:
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
+    verdict: Verdict | None = None  # None where nothing was removed
 
 
 class Store(Protocol):
@@ -172,6 +174,7 @@ class View:
 
     camera: Camera
     image: np.ndarray  # [H, W, 3] uint8
+    is_photo: bool = True  # False: drawn from the scene
 
 
 class _Run:
@@ -253,13 +256,24 @@ def remove_object(
     run.pictures += [Picture("chart", f"What photos show of {c.camera.id}", c.image, (c.hole,)) for c in shown]
     keep = ~masks.removed
     kept = scene.take(keep)
+
+    def judged(added: Gaussians | None, left: Sequence[ViewMasks], given: Reference | None) -> Verdict | None:
+        seen = {v.camera.id for v in views if v.is_photo}
+        still_open = [v.target for v in left]
+        return run(
+            "verdict",
+            lambda: judge(scene, keep, added, masks.views, still_open, levelled, seen, charts, hits, given),
+            lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
+        )
+
     for v in _spread(open_views):
         run.pictures.append(Picture("mask", f"Region to fill in {v.camera.id}", photos[v.camera.id], (v.target,)))
     if masks.hole_pixels == 0:
         why = "nothing to fill: every view sees what is behind the object"
         if masks.mode == "paper":
             why = "nothing to fill: what surrounds the box covers its outline in every view"
-        return _finish(run, keep, None, masks, charts, {}, [why])
+        verdict = judged(None, masks.views, None)
+        return replace(_finish(run, keep, None, masks, charts, {}, [why]), verdict=verdict)
 
     def emptied(v: ViewMasks) -> np.ndarray:
         """A view's photo with the emptied scene in the object's place."""
@@ -344,6 +358,9 @@ def remove_object(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
 
+    by_picture = reference_image is not None or settings.inpaint.startswith("file:")
+    verdict = judged(added, open_views, done[0] if done and by_picture else None)
+
     def finish(v: ViewMasks) -> None:
         name = v.camera.id
         painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
@@ -351,7 +368,7 @@ def remove_object(
     parallel_map(finish, masks.views)
     pictures = {r.camera.id: r.image for r in done}
     charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in shown)
-    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left)
+    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left, verdict=verdict)
 
 
 def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
@@ -974,4 +991,5 @@ STORED = (
     PaintedView,
     Appearance,
     Refinement,
+    Verdict,
 )

@@ -29,6 +29,16 @@ RULE_COLOURS = {
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
+MEANINGS = {  # of the verdict's figures
+    "open_share": "share of the hole that stays open",
+    "remains": "share of the object's pixels that still look like it",
+    "haze": "blend weight before the surface behind the object",
+    "ring_fidelity": "dB that the surroundings gained or lost against photos",
+    "sharpness": "detail of what was filled over that of its surroundings",
+    "agreement": "share of the object's pixels that look as photos, or other views, show the place",
+    "invented": "share of the object's pixels that no photo and no picture shows",
+    "expected_error": "dB by which the object's pixels are probably worse than its surroundings were",
+}
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
 STYLE = """
@@ -45,6 +55,8 @@ figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .book{max-width:720px}.book input{width:100%}
 .pair{display:flex;gap:1rem}.pair figure{flex:1}
 .bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
+.score{font-size:1.1rem;display:flex;gap:.8rem;align-items:center}
+.score div{width:12rem;background:var(--edge);border-radius:4px}.score div div{height:.9rem}
 .warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
 .dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
 """.strip()
@@ -243,7 +255,8 @@ def _page(
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
         f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"
         f"<p>{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
-        f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>{warnings}"
+        f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>"
+        f"{_verdict(summary.get('verdict'))}{warnings}"
         f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
         f"{_flip_book(flips)}"
         f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
@@ -252,6 +265,24 @@ def _page(
         f"<div class=grid>{stages}</div>"
         f"<h2>Counts</h2><table>{numbers}</table>"
         f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
+    )
+
+
+def _verdict(verdict: dict[str, Any] | None) -> str:
+    """The score as a bar from red to green, what it comes to, and its figures."""
+    if verdict is None:
+        return ""
+    score, words = verdict["score"], [html.escape(w) for w in verdict["words"]]
+    bar = f"<div><div style='width:{score:.0%};background:hsl({120 * score:.0f} 60% 45%)'></div></div>"
+    advice = "".join(f"<li>{w}</li>" for w in words[1:])
+    figures = "".join(
+        f"<tr><td>{name.replace('_', ' ')}</td><td class=n>{verdict[name]:.3f}</td><td>{meaning}</td></tr>"
+        for name, meaning in MEANINGS.items()
+        if verdict[name] is not None
+    )
+    return (
+        f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{advice}</ul>"
+        f"<details><summary>What the score is made of</summary><table>{figures}</table></details>"
     )
 
 

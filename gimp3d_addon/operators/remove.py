@@ -49,6 +49,8 @@ class RunsRemoval(RunsChild):
         settings.last_report = str(report) if report.exists() else ""
         for warning in summary["warnings"]:
             self.report({"WARNING"}, warning)
+        verdict = summary["verdict"] or {"score": 1.0, "words": []}
+        settings.score, settings.verdict = verdict["score"], "\n".join(verdict["words"])
         settings.hole = f"{counts['hole_pixels']:,} pixels in {counts['views']} views"
         self.report(
             {"INFO"}, f"{result.name}: {counts['removed']:,} splats removed, {counts['added']:,} added "

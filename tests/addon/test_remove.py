@@ -52,6 +52,7 @@ def test_remove_makes_a_new_object_hides_the_source_and_restores(folder: Path) -
     assert result.name == f"{splat.name} removed" and splat.hide_get() and splat.hide_render
     assert (np.array(result.matrix_world) == np.array(splat.matrix_world)).all()
     assert Path(bpy.context.scene.gimp3d.last_report).is_file()
+    assert 0 < bpy.context.scene.gimp3d.score < 1 and bpy.context.scene.gimp3d.verdict
     assert (folder / "gimp3d_jobs").is_dir()
     bpy.ops.gimp3d.export_ply(filepath=str(folder / "out.ply"))
     rows = {r.tobytes() for r in read_ply(folder / "scene.ply").table.rows}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
             {"name": s.name, "seconds": s.seconds, "confidence": s.confidence, "reason": "<b>"} for s in result.stages
         ],
         "counts": {"removed": 5, "added": 6},
+        "verdict": asdict(result.verdict) | {"words": ["fair", "<u>enlarge</u>"], "haze": None},
         "settings": {"inpaint": "file:<x>"},
         "warnings": ["<script>alert(1)</script>"],
     }
@@ -39,6 +41,8 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
     for name in pictures:
         assert read_image(tmp_path / name).size > 0
     assert "<script" not in page and "&lt;script&gt;" in page and "&lt;b&gt;" in page and "file:&lt;x&gt;" in page
+    assert result.verdict and f"<b>{result.verdict.score:.2f}</b>fair" in page and "<li>&lt;u&gt;enlarge" in page
+    assert "open share" in page and "haze" not in page
     choice = result.references[0]
     assert f"<b>{choice.camera_id}" in page and f"{choice.scores[0].score:.2f}" in page
     book = re.findall(r"<figure( hidden)?><img src='(view_\d+\.png)'", page)

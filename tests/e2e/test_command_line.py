@@ -75,6 +75,9 @@ def test_remove_keeps_rows_byte_for_byte_and_fills_the_hole(scene_folder: Path, 
         "warnings",
         "peak_memory_mb",
     }
+    verdict = summary["verdict"]
+    assert set(verdict) >= {"open_share", "remains", "haze", "ring_fidelity", "sharpness", "agreement", "words"}
+    assert 0 < verdict["score"] < 1 and verdict["words"]
     assert {"name", "seconds", "confidence", "reason"} <= set(summary["stages"][0])
     assert sum(v for k, v in counts.items() if k.startswith("added_of_degree_")) == counts["added"]
     row = (scene_folder / "scene.ply").stat().st_size // counts[

@@ -1,0 +1,420 @@
+"""How good a removal probably is, told without the truth.
+
+Where the object was, a pixel's true colour is what photos, or a picture that was given, show of the surface there.
+Where none does, all that is known is what the rim lets expect: its colours carried inwards, and how far apart they are
+at such a distance. From both follows the squared error to be expected of whatever is drawn: a fill, mud, haze, rests of
+the object, an open hole. The score compares it with the error of the surroundings before the removal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..camera import Camera
+from ..gaussians import Gaussians
+from ..raster import drawing, render
+from ..solvers.variogram import at_lag, foretell, variogram
+from ..threads import parallel_map
+from .charts import Chart, Hits
+from .masks import ViewMasks, sees
+from .propagate import Reference
+from .witness import Says, Witness, ask
+
+SAME = 0.02  # relative z within which two views show one surface
+EDGE = 3  # px next to the object that are mixed
+SCATTER = 4.0  # median distances of the drawn surface from a chart, from which something is before the chart
+UNLIKE = 24.0  # grey levels from which the object differs from what is behind it
+USUAL_ERROR = 65.0  # squared grey levels by which scenes miss photos, where there are none (30 dB)
+LEAST_ERROR = 1.0  # of 8-bit pictures
+HALF = 9.0  # times the error of the surroundings that scores ½ when it is added: 10 dB worse
+GOOD, FAIR = 0.75, 0.5  # scores
+FINE = 2.0  # px, σ of the blur that leaves no detail
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """How closely it is looked at."""
+
+    views: int = 8
+    points: int = 24_000  # pixels of the object in these views
+    ring: int = 24  # px round the object
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the removal is worth (CONTRACT: verdict). None: there is nothing that tells."""
+
+    score: float  # 0 bad … 1 good
+    open_share: float  # of the hole's pixels
+    remains: float  # share of the object's pixels that still look like it
+    haze: float | None  # blend weight before the charts, mean over the object's pixels
+    ring_fidelity: float | None  # dB, PSNR against photos round the object: after less before
+    sharpness: float | None  # detail of what was filled over that of its surroundings
+    agreement: float | None  # share of the object's pixels that look as photos, or other views, show the place
+    invented: float  # share of the object's pixels that nothing tells
+    expected_error: float  # dB by which the object's pixels are worse than the surroundings were
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A view of the removal; arrays [H, W], pictures [H, W, 3] float32 in grey levels, near the object only."""
+
+    view: ViewMasks
+    photo: np.ndarray
+    ring: np.ndarray  # bool
+    before: np.ndarray
+    after: np.ndarray
+    depth: np.ndarray  # z of what is drawn, 0 = nothing
+    chart: np.ndarray  # z of the charts, 0 = none
+    unsure: np.ndarray  # height by which the charts may be off, scene units
+    haze: np.ndarray  # blend weight before the charts
+    error: float  # mean squared error before the removal in as many pixels round the object as it has
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Every n-th row and column of a look; [h, w] or [h, w, 3]."""
+
+    object: np.ndarray  # bool
+    ring: np.ndarray  # bool, where something tells its colours
+    photo: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    expected: np.ndarray  # colours without the object
+    variance: np.ndarray  # of the true ones about them
+    told: np.ndarray  # bool, by photos
+    given: np.ndarray  # bool, by the given picture
+    points: np.ndarray
+
+    @property
+    def unseen(self) -> np.ndarray:
+        """Pixels of the object whose colours nothing tells."""
+        return self.object & ~self.told & ~self.given
+
+
+def judge(
+    scene: Gaussians,
+    keep: np.ndarray,  # [N] bool
+    added: Gaussians | None,
+    views: Sequence[ViewMasks],  # as they were to be filled
+    still_open: Sequence[np.ndarray],  # [H, W] bool each: what no reference reached
+    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, with the object, at the splats' exposure
+    photographed: Collection[str],  # IDs of those that are photos; others are drawn
+    charts: Sequence[Chart] = (),
+    hits: Mapping[str, Hits] | None = None,  # by ID
+    given: Reference | None = None,  # that a picture was given for
+    settings: VerdictSettings = VerdictSettings(),
+) -> Verdict | None:
+    """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
+    kept = scene.take(keep)
+    final = kept if added is None else kept.extended(added)
+    asked = [v for v in views if v.camera.id in photographed] or list(views)
+    witnesses = [_witness(v.camera, photos[v.camera.id], v.silhouette, v.depth_before) for v in asked]
+    floats, unsure = _floating(final, charts, witnesses), [_height_doubt(c) for c in charts]
+    showing = [v for v in asked if v.silhouette.any()]
+    if not showing:
+        return None
+    count = min(settings.views, len(showing))
+
+    def look(view: ViewMasks) -> _Look:
+        photo = photos[view.camera.id].astype(np.float32)
+        away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
+        near, around = away <= settings.ring, away > EDGE
+        beside = around & (away <= _reach(away[around], int(view.silhouette.sum())))
+        before = _drawn(scene, view.camera, (near & around) | beside)
+        weights = drawing(final, view.camera, with_colour=False, pixels=near)
+        chart, off = np.zeros((2, *near.shape), np.float32)
+        met = (hits or {}).get(view.camera.id)
+        if met is not None:
+            chart = met.depth
+            for number, height in enumerate(unsure):
+                on = (met.depth > 0) & (met.chart == number)
+                off[on] = height[met.rows[on], met.cols[on]]
+        return _Look(
+            view,
+            photo,
+            near & around,
+            before,
+            _drawn(final, view.camera, near),
+            weights.surface_depth()[0],
+            chart,
+            off,
+            weights.footprint(floats),
+            _mean([_squared(before, photo)[beside]]),
+        )
+
+    looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
+    total = sum(int(look.view.silhouette.sum()) for look in looks)
+    step = max(1, round(math.sqrt(total / settings.points)))
+    tolerance = max([c.tolerance for c in charts], default=SAME)
+    samples = parallel_map(lambda x: _sampled(x, step, witnesses, tolerance, given), looks)
+    return _summed(looks, samples, still_open, views, bool(photographed), bool(charts))
+
+
+def _summed(
+    looks: Sequence[_Look],
+    samples: Sequence[_Sample],
+    still_open: Sequence[np.ndarray],
+    views: Sequence[ViewMasks],
+    with_photos: bool,
+    with_charts: bool,
+) -> Verdict:
+    hole = sum(int(v.target.sum()) for v in views)
+    objects = _count(s.object for s in samples)
+    error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
+    added = _added_error(samples)
+    before = _mean(_squared(look.before, look.photo)[look.ring] for look in looks)
+    after = _mean(_squared(look.after, look.photo)[look.ring] for look in looks)
+    alike = _alike(looks, samples)
+    verdict = Verdict(
+        score=1 / (1 + added / (HALF * error)),
+        open_share=_count(still_open) / max(1, hole),
+        remains=_count(map(_like_object, samples)) / objects,
+        haze=_mean(look.haze[look.view.silhouette] for look in looks) if with_charts else None,
+        ring_fidelity=10 * math.log10(max(before, LEAST_ERROR) / max(after, LEAST_ERROR)) if with_photos else None,
+        sharpness=_sharpness(looks),
+        agreement=float(alike.mean()) if with_photos and len(alike) else None,
+        invented=_count(s.unseen for s in samples) / objects,
+        expected_error=10 * math.log10(1 + added / error),
+        words=(),
+    )
+    return replace(verdict, words=_words(verdict))
+
+
+def _added_error(samples: Sequence[_Sample]) -> float:
+    """The mean squared error to be expected of the object's pixels beyond that of the scene itself, grey levels²."""
+    photo, picture = [s.object & s.told for s in samples], [s.object & s.given for s in samples]
+    unseen = [s.unseen for s in samples]
+
+    def missed(where: Sequence[np.ndarray]) -> float:
+        return _mean(_squared(s.after, s.expected)[w] for s, w in zip(samples, where))
+
+    def unknown(where: Sequence[np.ndarray]) -> float:
+        return _mean(s.variance[w] for s, w in zip(samples, where))
+
+    usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
+    # What other views show differs from what this one sees: by as much as it does round the object, nothing is wrong.
+    # Where nothing shows a place, the truth differs from what is expected as texture does, however little the fill.
+    errors = (
+        max(0.0, missed(photo) - usual),
+        max(0.0, missed(picture) - usual) + unknown(picture),
+        max(missed(unseen), unknown(unseen)),
+    )
+    pixels = [_count(where) for where in (photo, picture, unseen)]
+    return float(np.average(errors, weights=pixels))
+
+
+def _alike(looks: Sequence[_Look], samples: Sequence[_Sample]) -> np.ndarray:
+    """[N] bool: pixels of the object that differ from photos, else from other views, as is usual round it."""
+    usual = np.concatenate([_squared(s.before, s.expected)[s.ring] for s in samples])
+    limit = max(LEAST_ERROR, float(np.percentile(usual, 95)) if len(usual) else 0.0)
+    drawn = [
+        _witness(look.view.camera, np.rint(look.after).astype(np.uint8), np.zeros(look.depth.shape, bool), look.depth)
+        for look in looks
+    ]
+    found = []
+    for k, sample in enumerate(samples):
+        found.append(_squared(sample.after, sample.expected)[sample.object & sample.told] <= limit)
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME)
+        found.append((_squared(sample.after[sample.unseen], colours) <= limit)[seen])
+    return np.concatenate(found)
+
+
+def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.ndarray) -> Witness:
+    return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
+
+
+def _reach(away: np.ndarray, count: int) -> float:
+    """The distance within which so many of the pixels [N] lie."""
+    k = min(count, len(away)) - 1
+    return float(np.partition(away, k)[k]) if k >= 0 else 0.0
+
+
+def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """[h, w]: mean of the channels' squared differences."""
+    return np.asarray(((a - b) ** 2).mean(-1))
+
+
+def _mean(parts: Iterable[np.ndarray]) -> float:
+    """Of all numbers in the arrays; 0 of none."""
+    all_ = np.concatenate(list(parts))
+    return float(all_.mean(dtype=np.float64)) if len(all_) else 0.0
+
+
+def _count(masks: Iterable[np.ndarray]) -> int:
+    return sum(int(m.sum()) for m in masks)
+
+
+def _like_object(sample: _Sample) -> np.ndarray:
+    """[h, w] bool: drawn more like the photo with the object than like what is expected without it."""
+    change, made = sample.photo - sample.expected, sample.after - sample.expected
+    along = cv2.blur((made * change).sum(-1), (3, 3)) > 0.5 * cv2.blur((change**2).sum(-1), (3, 3))
+    return sample.object & along & (_squared(sample.photo, sample.expected) > UNLIKE**2)
+
+
+def _sharpness(looks: Sequence[_Look]) -> float | None:
+    """Median detail of what was filled, over that of the same surfaces round the object."""
+    filled, beside = [], []
+    for look in looks:
+        grey = cv2.cvtColor(look.after, cv2.COLOR_RGB2GRAY)
+        detail = np.abs(grey - cv2.GaussianBlur(grey, (0, 0), FINE))
+        inner = cv2.erode(look.view.target.astype(np.uint8), np.ones((2 * EDGE - 1,) * 2, np.uint8)) > 0
+        on_chart = (look.chart == 0) | (np.abs(look.depth - look.chart) < SAME * look.chart)
+        filled.append(detail[inner])
+        beside.append(detail[look.ring & on_chart & (look.depth > 0)])
+    if not any(map(np.size, filled)) or not any(map(np.size, beside)):
+        return None
+    return float(np.median(np.concatenate(filled)) / max(1e-3, np.median(np.concatenate(beside))))
+
+
+def _sampled(
+    look: _Look, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
+) -> _Sample:
+    camera = look.view.camera
+    thin = (slice(None, None, step), slice(None, None, step))
+    object_, ring, photo, depth, chart = (
+        a[thin] for a in (look.view.silhouette, look.ring, look.photo, look.depth, look.chart)
+    )
+    others = [w for w in witnesses if w.camera.id != camera.id]
+    centres = camera.pixel_centres()[thin]
+    # charts are what was behind the object, unless photos show what is drawn before them
+    standing = object_ & (depth > 0) & (depth < (1 - tolerance) * chart)
+    standing[standing] = shown(others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME)[1]
+    off_chart = (chart == 0) | standing | (ring & (np.abs(depth - chart) > tolerance * chart))
+    surface = np.where(off_chart, depth, chart)
+    points = camera.unproject(centres, surface.astype(np.float64))
+    asked = (object_ | ring) & (surface > 0)
+    told, by_picture = np.zeros((2, *asked.shape), bool)
+    expected = photo.copy()
+    colours, told[asked] = shown(others, points[asked], SAME, tolerance)
+    expected[told] = colours[told[asked]]
+    if given is not None:
+        left = object_ & asked & ~told
+        depth_given = np.where(given.target, given.depth, 0)
+        by_picture[left] = sees(given.camera, depth_given, points[left], tolerance)
+        expected[by_picture] = _colours(given.image, given.camera, points[by_picture])
+    foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~object_ | told | by_picture)
+    unknown = object_ & ~told & ~by_picture
+    expected[unknown] = foretold[unknown]
+    if given is not None:
+        variance += by_picture * 2 * at_lag(lags, _shift(look, thin, points, surface, given.camera) / step)
+    return _Sample(
+        object_, ring & told, photo, look.before[thin], look.after[thin], expected, variance, told, by_picture, points
+    )
+
+
+def shown(
+    witnesses: Sequence[Witness],
+    points: np.ndarray,  # [N, 3]
+    tolerance: float,  # relative z by which what a view shows may be nearer
+    farther: float | None = None,  # by which it may be farther; None: as much
+) -> tuple[np.ndarray, np.ndarray]:
+    """The median colour of the views that show a point [N, 3] float32, 0 of none; and whether any does [N]."""
+    seen = ask(witnesses, points, farther or tolerance) == Says.SEEN
+    seen &= ask(witnesses, points, tolerance) != Says.BEHIND
+    colours = np.full((len(witnesses), len(points), 3), np.nan, np.float32)
+    for k, witness in enumerate(witnesses):
+        colours[k, seen[k]] = _colours(witness.photo, witness.camera, points[seen[k]])
+    told, median = seen.any(0), np.zeros((len(points), 3), np.float32)
+    if told.any():
+        median[told] = np.nanmedian(colours[:, told], axis=0)
+    return median, told
+
+
+def _colours(
+    picture: np.ndarray,  # [H, W, 3] uint8
+    camera: Camera,
+    points: np.ndarray,  # [N, 3]
+) -> np.ndarray:
+    """[N, 3] float32, between pixels."""
+    if not len(points):
+        return np.zeros((0, 3), np.float32)
+    x, y = (camera.project(points)[0] - 0.5).astype(np.float32).T[:, :, None].copy()
+    return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.float32)
+
+
+def _shift(look: _Look, thin: tuple[slice, slice], points: np.ndarray, surface: np.ndarray, eye: Camera) -> np.ndarray:
+    """[h, w] px by which a view may see another one's pixels elsewhere, as the surface's height is not known."""
+    here, there = points - look.view.camera.centre, points - eye.centre
+    lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
+    sine = np.linalg.norm(np.cross(here, there), axis=-1) / np.maximum(lengths, 1e-12)
+    return look.view.camera.fx * look.unsure[thin] * sine / np.maximum(surface, 1e-9)
+
+
+def _height_doubt(chart: Chart) -> np.ndarray:
+    """[H, W] standard deviation of a relief's height where no photo shows it, scene units; 0 on planes."""
+    if chart.kind == "plane" or not chart.known.any():
+        return np.zeros(chart.depth.shape, np.float32)
+    away = cv2.distanceTransform((~chart.known).astype(np.uint8), cv2.DIST_L2, 5)
+    lags = variogram(chart.depth[..., None], chart.known, float(away[chart.hole].max(initial=0)))
+    return np.sqrt(at_lag(lags, away)).astype(np.float32)
+
+
+def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence[Witness]) -> np.ndarray:
+    """[N] bool: Gaussians before all charts that lie there, in the object's way and shown by no photo."""
+    points = gaussians.means.astype(np.float64)
+    before, other = np.zeros((2, len(points)), bool)
+    for chart in charts:
+        uv, z = chart.camera.project(points)
+        with np.errstate(invalid="ignore"):
+            framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
+        cols, rows = uv[framed].astype(int).T
+        nearer = z[framed] < chart.depth[rows, cols] - SCATTER * chart.noise
+        before[framed] |= chart.there[rows, cols] & nearer
+        other[framed] |= chart.there[rows, cols] & ~nearer
+    rows = np.flatnonzero(before & ~other & gaussians.usable)
+    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME))
+    found = np.zeros(len(points), bool)
+    found[rows] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
+    return found
+
+
+def _drawn(gaussians: Gaussians, camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """[H, W, 3] float32, grey levels."""
+    rgb = render(gaussians, camera, passes=frozenset({"rgb"}), pixels=pixels).rgb
+    return np.clip(255 * rgb, 0, 255).astype(np.float32)
+
+
+def _words(v: Verdict) -> tuple[str, ...]:
+    """What it comes to; then, of each thing that is amiss, how much, and what to do."""
+    level = "good" if v.score >= GOOD else "fair" if v.score >= FAIR else "poor"
+    times = 10 ** (v.expected_error / 20)
+    detail = 1.0 if v.sharpness is None else v.sharpness
+    amiss = (
+        (
+            v.open_share > 0.02,
+            f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best",
+        ),
+        (
+            v.remains > 0.05,
+            f"{v.remains:.0%} of the object's place still looks like it: enlarge the box until all of it is inside",
+        ),
+        (
+            (v.haze or 0) > 0.05,
+            f"haze covers {v.haze or 0:.0%} of what was behind the object: enlarge the box, or add one round the haze",
+        ),
+        (
+            (v.ring_fidelity or 0) < -0.5,
+            f"the surroundings lost {-(v.ring_fidelity or 0):.1f} dB against the photos: make the box tighter",
+        ),
+        (
+            not 0.5 < detail < 2,
+            f"the fill has {detail:.1f} times the detail of its surroundings: paint one view, or try another seed",
+        ),
+        (
+            v.agreement is not None and v.agreement < 0.7,
+            f"only {v.agreement or 0:.0%} of the object's place looks as photos show it: mark shadows and reflections",
+        ),
+        (
+            v.invented > 0.3,
+            f"no photo shows {v.invented:.0%} of the object's place: paint one view if the fill does not convince",
+        ),
+    )
+    first = f"{level}: errors where the object was are probably {times:.1f} times those round it"
+    return (first, *(words for wrong, words in amiss if wrong))
