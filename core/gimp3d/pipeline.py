@@ -449,7 +449,7 @@ def _chart(
         Witness(v.camera, photos[v.camera.id], o | m, s, v.depth_before) for v, (o, s), m in zip(views, objects, marked)
     ]
     planes = find_planes(views, witnesses, region, settings.charts)
-    charts = draw_charts(planes, views, witnesses, region, settings.charts)
+    charts = draw_charts(planes, views, witnesses, region, settings.charts, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
     tolerance = max(c.tolerance for c in charts)

@@ -18,7 +18,8 @@ from ..box import Region, in_region
 from ..camera import Camera
 from ..solvers.thin_plate import thin_plate
 from ..threads import parallel_map, run_ranges
-from .masks import ViewMasks
+from .footprint import shows_object
+from .masks import ViewMasks, sees
 from .mosaic import mosaic
 from .outline import surface_points, window_round
 from .witness import Says, Textures, Witness, ask, meet_range, pack
@@ -30,6 +31,7 @@ CHART = "chart"  # split of their cameras
 PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
+SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 
 
@@ -110,6 +112,7 @@ class Chart:
     known: np.ndarray  # bool, photos show it, and much the same
     beside: np.ndarray  # bool, photos show it right beside the object only
     hole: np.ndarray  # bool, the object hides it in some photos, and none shows it, or they show its rests
+    below: np.ndarray  # bool, known only from what the object's rough mask covers
     agreement: float  # of the photos round the hole, see Textures
     noise: float  # median distance of the views' drawn surfaces from it, scene units
     tolerance: float  # relative z within which a view's drawn surface is this one
@@ -199,13 +202,14 @@ def draw_charts(
     witnesses: Sequence[Witness],  # of the same views
     region: Region,
     settings: ChartSettings = ChartSettings(),
+    marked: Sequence[np.ndarray] = (),  # [H, W] bool, of the same views: to be filled whatever they show
 ) -> tuple[Chart, ...]:
     """What photos show of the surfaces at the planes; those without a hole are left out."""
     textures = Textures.make(witnesses)
     charts: list[Chart] = []
     for plane in planes:
         others = [p for p in planes if abs(p.normal @ plane.normal) <= PARALLEL]
-        chart = _chart(plane, others, extent(region), views, witnesses, textures, settings)
+        chart = _chart(plane, others, region, views, witnesses, marked, textures, settings)
         if chart is not None:
             charts.append(chart)
     bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
@@ -300,12 +304,14 @@ def _settled(plane: Plane, half: float, textures: Textures, settings: ChartSetti
 def _chart(
     plane: Plane,
     others: Sequence[Plane],  # that it may meet
-    diagonal: float,
+    region: Region,
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
+    marked: Sequence[np.ndarray],
     textures: Textures,
     settings: ChartSettings,
 ) -> Chart | None:
+    diagonal = extent(region)
     x, y = _grid(2 * diagonal, 200)
     said = ask(witnesses, plane.points(x, y).reshape(-1, 3), settings.tolerance).reshape(-1, 200, 200)
     hole = _unseen(said, settings)
@@ -369,12 +375,29 @@ def _chart(
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said, settings), _there(said)
     hole &= there
-    image, spread = mosaic(camera, surface.reshape(height, width, 3), plane.normal, witnesses, said)
-    photos = (said == Says.SEEN).sum(0).astype(np.uint16)
-    beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
-    alike = _alike(spread, there & (photos > 1) & ~hole)
+    points = surface.reshape(height, width, 3)
+    image, spread = mosaic(points, plane.normal, witnesses, said)
+    photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
+    limit = _usual_spread(spread[there & (photos > 1) & ~hole])
+    alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
-    hole |= there & (photos > 0) & ~alike & ((said == Says.HIDDEN).sum(0) > photos)
+    hole |= there & (photos > 0) & ~alike & (hiding > photos)
+
+    # the object's mask is rough: where photos agree below it, and on the surface's colours, they show the surface
+    beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
+    below, spread_below = mosaic(points, plane.normal, witnesses, beneath)
+    image[hole] = below[hole]
+    known = alike & there & (photos > 1) & ~hole
+    far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    inside = in_region(region, surface).reshape(height, width)
+    doubtful = hole | (there & (photos + hiding > 0) & (inside | (far < SOFT)))
+    around = known & ~doubtful & (far < math.sqrt(hole.sum()))
+    object_ = shows_object(image, doubtful, _object_colours(plane, witnesses, tolerance), image[around])
+    free = hole & ~object_ & (hiding > 1) & (spread_below <= limit) & ~_marked(surface, witnesses, marked, hole.shape)
+    hole = (hole & ~free) | (doubtful & object_)
+    photos[free], known = hiding[free], (known | free) & ~hole
+    beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
+    image[hole] = 0
     return Chart(
         camera,
         plane,
@@ -383,9 +406,10 @@ def _chart(
         there,
         image,
         photos,
-        alike & there & (photos > 1) & ~hole,
-        beside & ~hole,
+        known,
+        beside,
         hole,
+        free & ~hole,
         agreement,
         noise,
         tolerance,
@@ -393,14 +417,37 @@ def _chart(
     )
 
 
-def _alike(spread: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """[H, W] bool: texels of which photos tell much the same: things that stand on the surface smear over it.
+def _usual_spread(spread: np.ndarray) -> float:
+    """By how much photos' textures may differ and still show the surface: else they show what stands on it.
 
     A quarter of what several photos show is taken for the surface itself.
     """
-    if not told.any():
-        return np.ones(told.shape, bool)
-    return spread <= max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread[told], 25)))
+    return max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread, 25))) if len(spread) else LEAST_SPREAD
+
+
+def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> np.ndarray:
+    """[N, 3] uint8: what photos show of the object where it is clearly nearer than the plane."""
+
+    def of(witness: Witness) -> np.ndarray:
+        c = witness.camera
+        rays = c.unproject(c.pixel_centres(), np.ones(witness.hidden.shape)) - c.centre
+        with np.errstate(divide="ignore"):
+            z = ((plane.origin - c.centre) @ plane.normal) / (rays @ plane.normal)
+        before = witness.depth < (1 - tolerance) * np.where(z > 0, z, np.inf)
+        return witness.photo[witness.hidden & (witness.depth > 0) & before]
+
+    return np.concatenate(parallel_map(of, witnesses))
+
+
+def _marked(
+    points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
+    """[H, W] bool: texels at points [H·W, 3] that the user marked in some view."""
+    found = np.zeros(len(points), bool)
+    for witness, mask in zip(witnesses, marked):
+        if mask.any():
+            found |= sees(witness.camera, mask.astype(np.float32), points, np.inf)
+    return found.reshape(shape)
 
 
 def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:

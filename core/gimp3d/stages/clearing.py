@@ -138,7 +138,7 @@ def chart_targets(
         unseen = np.zeros(window.shape, bool)
         for number, chart in enumerate(charts):
             there = hits.chart == number
-            unseen[there] = chart.hole[hits.rows[there], hits.cols[there]]
+            unseen[there] = (chart.hole | chart.below)[hits.rows[there], hits.cols[there]]
         met = hits.depth > 0
         bare = met & (alpha_after < settings.solid)
         before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)

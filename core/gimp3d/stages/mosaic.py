@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ..camera import Camera
 from ..jit import exact_kernel
 from ..threads import parallel_map, run_ranges
 from .witness import Says, Witness, texture
@@ -17,8 +16,7 @@ FEW = 12.0  # grey levels by which a photo may always differ from what most say
 
 
 def mosaic(
-    camera: Camera,
-    points: np.ndarray,  # [H, W, 3] scene coordinates of what its pixels show
+    points: np.ndarray,  # [H, W, 3] scene coordinates of its texels
     normal: np.ndarray,  # [3] unit
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask

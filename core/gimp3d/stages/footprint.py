@@ -1,0 +1,33 @@
+"""Which texels of a chart show the object rather than the surface: by the colours of both."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+SAMPLES = 128  # colours of each kind, squared, that the two models are made of
+
+
+def shows_object(
+    picture: np.ndarray,  # [H, W, 3] uint8
+    doubtful: np.ndarray,  # [H, W] bool, texels that may show either; all others show the surface
+    object_colours: np.ndarray,  # [N, 3] uint8
+    surface_colours: np.ndarray,  # [M, 3] uint8
+) -> np.ndarray:
+    """[H, W] bool: doubtful texels that look like the object; all of them where there is nothing to compare with.
+
+    Two Gaussian mixtures and a minimum cut along edges of the picture (GrabCut: Rother 2004). The models stay as they
+    are learned from what is certain: in the doubtful texels either kind may be missing.
+    """
+    if not doubtful.any() or not len(object_colours) or not len(surface_colours):
+        return doubtful.copy()
+    rng = np.random.default_rng(0)
+    certain = [c[rng.integers(0, len(c), (SAMPLES, SAMPLES))] for c in (object_colours, surface_colours)]
+    labels = np.repeat(np.array([cv2.GC_FGD, cv2.GC_BGD], np.uint8), SAMPLES)[:, None].repeat(SAMPLES, 1)
+    labels[[0, -1], [0, -1]] = cv2.GC_PR_FGD, cv2.GC_PR_BGD  # it refuses to work where nothing is in doubt
+    models = np.zeros((2, 1, 65))
+    cv2.setRNGSeed(0)
+    cv2.grabCut(np.concatenate(certain), labels, None, models[1], models[0], 1, cv2.GC_INIT_WITH_MASK)
+    labels = np.where(doubtful, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
+    cv2.grabCut(np.ascontiguousarray(picture), labels, None, models[1], models[0], 1, cv2.GC_EVAL_FREEZE_MODEL)
+    return labels == cv2.GC_PR_FGD
