@@ -63,7 +63,6 @@ from .stages.witness import Witness
 from .threads import parallel_map
 
 R = TypeVar("R")
-DOUBTFUL = 8  # texels round a chart's hole that are filled anew if photos show them beside the object only
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
@@ -352,7 +351,7 @@ def remove_object(
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     buffers.release()
-    keep, added = _refined(run, scene, keep, added, masks, painted, told, settings)
+    added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
@@ -563,7 +562,6 @@ def _texels_to_fill(
     """[H, W] bool each: texels that views need, and those that are filled for that, as no photo shows them well."""
     target = _needed_texels(chart, number, views, hits)
     hole = target & (chart.hole | (chart.photos == 0))
-    hole |= chart.beside & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * DOUBTFUL + 1,) * 2, np.uint8)) > 0)
     return target, hole
 
 
@@ -590,23 +588,22 @@ def _needed_texels(chart: Chart, number: int, views: Sequence[ViewMasks], hits: 
 
 def _refined(
     run: _Run,
-    scene: Gaussians,
-    keep: np.ndarray,  # [N] bool
+    kept: Gaussians,
     added: Gaussians | None,
     masks: Masks,
     painted: dict[str, np.ndarray],
     told: dict[str, np.ndarray],
     settings: RemovalSettings,
-) -> tuple[np.ndarray, Gaussians | None]:
-    """What stays and the new Gaussians, optimised where the settings ask for it."""
+) -> Gaussians | None:
+    """The new Gaussians, optimised where the settings ask for it."""
     if added is None or not settings.refine.steps:
-        return keep, added
+        return added
     views = [observed(v.camera, painted[v.camera.id], told[v.camera.id]) for v in masks.views if v.camera.id in told]
     refinement: Refinement = run(
         "refine",
-        lambda: refine_gaussians(scene.take(keep), added, views, settings.refine, settings.random_seed, run.progress),
+        lambda: refine_gaussians(kept, added, views, settings.refine, settings.random_seed, run.progress),
     )
-    return keep, refinement.gaussians
+    return refinement.gaussians
 
 
 def _fill_from_one_view(

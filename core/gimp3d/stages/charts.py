@@ -31,6 +31,7 @@ CHART = "chart"  # split of their cameras
 PARALLEL = 0.9  # cosine of two planes' normals above which they do not bound each other
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
+MIXED = 2  # texels round the object whose pixels show some of it
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 
@@ -58,7 +59,6 @@ class ChartSettings:
     sunk: float = 0.97  # share of the photos' agreement that a plane keeps where it is laid onto the drawn surface
     height: float = 0.25  # of a relief at most; what is higher stands on the surface
     largest: int = 900  # px, side of a chart at most
-    witnesses: int = 1  # photos that must show a texel
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,6 @@ class Chart:
     image: np.ndarray  # [H, W, 3] uint8, from photos; 0 where none shows it
     photos: np.ndarray  # uint16, how many show it
     known: np.ndarray  # bool, photos show it, and much the same
-    beside: np.ndarray  # bool, photos show it right beside the object only
     hole: np.ndarray  # bool, the object hides it in some photos, and none shows it, or they show its rests
     below: np.ndarray  # bool, known only from what the object's rough mask covers
     agreement: float  # of the photos round the hole, see Textures
@@ -314,7 +313,7 @@ def _chart(
     diagonal = extent(region)
     x, y = _grid(2 * diagonal, 200)
     said = ask(witnesses, plane.points(x, y).reshape(-1, 3), settings.tolerance).reshape(-1, 200, 200)
-    hole = _unseen(said, settings)
+    hole = _unseen(said)
     labels, _ = scipy.ndimage.label(hole)
     near = np.hypot(x, y) < diagonal
     hole &= np.isin(labels, np.unique(labels[near & hole]))
@@ -373,7 +372,7 @@ def _chart(
     # what lies behind a wall says nothing of how the floor's depths scatter
     tolerance = _tolerance(surface[before] if before.sum() > TELLING else surface, witnesses, settings)
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
-    hole, there = _unseen(said, settings), _there(said)
+    hole, there = _unseen(said), _there(said)
     hole &= there
     points = surface.reshape(height, width, 3)
     image, spread = mosaic(points, plane.normal, witnesses, said)
@@ -392,11 +391,12 @@ def _chart(
     inside = in_region(region, surface).reshape(height, width)
     doubtful = hole | (there & (photos + hiding > 0) & (inside | (far < SOFT)))
     around = known & ~doubtful & (far < math.sqrt(hole.sum()))
-    object_ = shows_object(image, doubtful, _object_colours(plane, witnesses, tolerance), image[around])
-    free = hole & ~object_ & (hiding > 1) & (spread_below <= limit) & ~_marked(surface, witnesses, marked, hole.shape)
+    object_ = shows_object(image, doubtful, hole, _object_colours(plane, witnesses, tolerance), image[around])
+    touched = cv2.dilate(object_.astype(np.uint8), np.ones((2 * MIXED + 1,) * 2, np.uint8)) > 0
+    free = hole & ~touched & (hiding > 1) & (spread_below <= limit) & ~_marked(surface, witnesses, marked, hole.shape)
+    free = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
     hole = (hole & ~free) | (doubtful & object_)
     photos[free], known = hiding[free], (known | free) & ~hole
-    beside = ~hole & (photos == 0) & (said == Says.BESIDE).any(0)
     image[hole] = 0
     return Chart(
         camera,
@@ -407,7 +407,6 @@ def _chart(
         image,
         photos,
         known,
-        beside,
         hole,
         free & ~hole,
         agreement,
@@ -467,11 +466,11 @@ def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: Char
     return float(np.clip(spread, settings.tolerance, 4 * settings.tolerance))
 
 
-def _unseen(said: np.ndarray, settings: ChartSettings) -> np.ndarray:
+def _unseen(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
     seen = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).sum(0)
     hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
-    return (seen < settings.witnesses) & (hidden > behind)
+    return (seen == 0) & (hidden > behind)
 
 
 def _there(said: np.ndarray) -> np.ndarray:

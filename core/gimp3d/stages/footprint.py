@@ -11,16 +11,17 @@ SAMPLES = 128  # colours of each kind, squared, that the two models are made of
 def shows_object(
     picture: np.ndarray,  # [H, W, 3] uint8
     doubtful: np.ndarray,  # [H, W] bool, texels that may show either; all others show the surface
+    presumed: np.ndarray,  # [H, W] bool, those that show the object as far as is known without colours
     object_colours: np.ndarray,  # [N, 3] uint8
     surface_colours: np.ndarray,  # [M, 3] uint8
 ) -> np.ndarray:
-    """[H, W] bool: doubtful texels that look like the object; all of them where there is nothing to compare with.
+    """[H, W] bool: doubtful texels that look like the object; the presumed ones where there is nothing to compare.
 
     Two Gaussian mixtures and a minimum cut along edges of the picture (GrabCut: Rother 2004). The models stay as they
     are learned from what is certain: in the doubtful texels either kind may be missing.
     """
     if not doubtful.any() or not len(object_colours) or not len(surface_colours):
-        return doubtful.copy()
+        return doubtful & presumed
     rng = np.random.default_rng(0)
     certain = [c[rng.integers(0, len(c), (SAMPLES, SAMPLES))] for c in (object_colours, surface_colours)]
     labels = np.repeat(np.array([cv2.GC_FGD, cv2.GC_BGD], np.uint8), SAMPLES)[:, None].repeat(SAMPLES, 1)

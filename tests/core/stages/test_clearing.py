@@ -28,6 +28,7 @@ UP = np.array([0.0, 0, 1])
 EYES = cameras(9, 160, 120)
 TOLERANCE = 0.02
 NONE = np.zeros((120, 160), bool)  # no marks
+RED = np.array([200, 20, 20], np.uint8)  # of the block; the floor is grey
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def removal(extra: Gaussians | None = None) -> Removal:
     selection = Selection(fates)
     masks = object_pixels(whole, selection.removed, views, ClearingSettings())
     witnesses = [
-        Witness(v.camera, np.full((*v.depth_before.shape, 3), 99, np.uint8), shown, some, v.depth_before)
+        Witness(v.camera, np.where(shown[..., None], RED, np.full(3, 99, np.uint8)), shown, some, v.depth_before)
         for v, (shown, some) in zip(views, masks)
     ]
     return Removal(whole, selection, views, witnesses)
