@@ -105,7 +105,7 @@ def clear_air(
     rows = np.flatnonzero(stays)[near & kept.usable]
     means = scene.means[rows].astype(np.float64)
     for chart in charts:
-        rest = sees(chart.camera, (chart.hole & (chart.photos > 0)).astype(np.float32), means, np.inf)
+        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
         height = chart.plane.local(means)[:, 2]
         low = np.abs(height) < settings.low * extent(region)
         fates[rows[rest & low]] = Fate.REMOVED_REVEALED
