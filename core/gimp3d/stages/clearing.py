@@ -12,8 +12,8 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..threads import parallel_map
-from .charts import Chart, Hits, first_hits
-from .masks import ViewMasks
+from .charts import Chart, Hits, extent, first_hits
+from .masks import ViewMasks, sees
 from .outline import window_mask
 from .selection import Fate, Selection, SelectionSettings, near_region
 from .witness import Says, Witness, ask
@@ -31,6 +31,7 @@ class ClearingSettings:
     observed: float = 0.5  # share of a Gaussian's weight that photos must show
     shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
     solid: float = 0.5  # alpha below which the scene has no surface
+    low: float = 0.1  # diagonals above the surface up to which a rest of the object may stand
     margin: int = 1  # px by which a target grows within what the object hides
 
 
@@ -85,8 +86,12 @@ def clear_air(
     witnesses: Sequence[Witness],
     tolerance: float,
     settings: ClearingSettings = ClearingSettings(),
+    charts: Sequence[Chart] = (),
 ) -> Selection:
-    """Remove what only the removal reveals, where no photo shows that anything is."""
+    """Remove what only the removal reveals, where no photo shows that anything is; and rests of the object.
+
+    A rest stands on a texel whose picture shows the object though it lies beside the object's mask.
+    """
     stays = ~selection.removed
     kept = scene.take(stays)
     near = near_region(scene, region, SelectionSettings(near=1.0))[stays]
@@ -97,6 +102,13 @@ def clear_air(
     vouched = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     fates = selection.fates.copy()
     fates[np.flatnonzero(stays)[candidates[~vouched]]] = Fate.REMOVED_REVEALED
+    rows = np.flatnonzero(stays)[near & kept.usable]
+    means = scene.means[rows].astype(np.float64)
+    for chart in charts:
+        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
+        height = chart.plane.local(means)[:, 2]
+        low = np.abs(height) < settings.low * extent(region)
+        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 
@@ -142,7 +154,7 @@ def chart_targets(
         met = hits.depth > 0
         bare = met & (alpha_after < settings.solid)
         before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)
-        target = (unseen & hidden & ~before) | (bare & (hidden | touched) & (view.alpha_before >= settings.solid))
+        target = (unseen & (hidden | touched) & ~before) | (bare & (hidden | touched) & (view.alpha_before >= settings.solid))
         target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
         target &= met & ~before & (hidden | touched) & ~view.occluder
