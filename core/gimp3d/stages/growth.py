@@ -28,10 +28,13 @@ class GrowthSettings:
     """What belongs to an object that a box cuts."""
 
     reach: float = 0.5  # how far from a box its rest may lie, as a share of the box's longest edge
-    touch: float = 4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
+    touch: float = (
+        4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
+    )
     colour: float = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
     bins: int = 12  # of each channel in the histograms of the object's and the surroundings' colours
-    likely: float = 0.9  # probability by colour from which a Gaussian on the surface is not of the surface
+    likely: float = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
+    unlikely: float = 0.1  # probability up to which one off the surface is something else
     share: float = 0.1  # of a part's Gaussians that the boxes must hold
     least: int = 10  # Gaussians of a piece that is worth proposing
     shown: float = 0.5  # weight below which a Gaussian shows nothing
@@ -99,15 +102,16 @@ def find_growth(
         on_surface |= part.distance(points) <= part.cell + longest[rows]
     colours = np.clip(0.5 + SH_C0 * gaussians.sh[rows, 0], 0, 1)
     like = _likelihood(colours, shown[rows], object_ & ~on_surface, ~object_ & on_surface, settings.bins)
-    nodes = object_ | ~on_surface | (like > settings.likely)
-    rows, points, object_, colours = rows[nodes], points[nodes], object_[nodes], colours[nodes]
+    nodes = object_ | (like > np.where(on_surface, settings.likely, settings.unlikely))
+    rows, points, object_, colours, like = (a[nodes] for a in (rows, points, object_, colours, like))
     tree = cKDTree(points[object_])
-    radius = settings.touch * float(np.median(tree.query(points[object_], k=min(6, tree.n))[0][:, -1]))
+    spacing = float(np.median(tree.query(points[object_], k=min(6, tree.n))[0][:, -1]))
+    radius = settings.touch * spacing
     pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
     pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < settings.colour).all(1)]
     parts = _components(pairs, len(rows))
     held, cut = np.bincount(parts[object_], minlength=len(rows)), np.bincount(parts[~object_], minlength=len(rows))
-    known = in_region([_enlarged(box, -2 * radius) for box in outer], points)
+    known = in_region([_enlarged(box, -spacing) for box in outer], points)
     endless = np.bincount(parts[~object_ & ~known], minlength=len(rows)) > 0
     ours = held >= np.maximum(1, settings.share * (held + cut))
     grown = np.flatnonzero((ours & ~endless)[parts] & ~object_)
@@ -115,7 +119,8 @@ def find_growth(
     renumbered[grown] = np.arange(len(grown))
     within = renumbered[pairs]
     pieces = _components(within[(within >= 0).all(1)], len(grown))
-    grown = grown[np.bincount(pieces, minlength=1)[pieces] >= settings.least]
+    sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
+    grown = grown[((sizes >= settings.least) & (likes > sizes / 2))[pieces]]
     too_much = len(grown) > object_.sum()
     if not len(grown) or too_much:
         return replace(none, endless=bool(too_much or (ours & endless & (cut >= settings.least)).any()))

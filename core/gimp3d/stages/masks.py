@@ -241,7 +241,9 @@ def find_masks(
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
     confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
     told = [growth.words] if growth and growth.words else []
-    return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), (*warnings, *told), growth)
+    return Masks(
+        selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), (*warnings, *told), growth
+    )
 
 
 def _inconsistencies(before: Sequence[_Before], agreement: float, settings: MaskSettings) -> tuple[str, ...]:
@@ -350,7 +352,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def _choose(
     gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, masks: MaskSettings
 ) -> tuple[Selection, list[_Before], Growth | None]:
-    """Which Gaussians go, by what the views show of them; the views, with what else the user named masked out; the rest.
+    """Which Gaussians go, by what views show of them; the views, what else the user named masked out; what was cut off.
 
     Where nothing stands out of the surface in a box, the surface itself is meant: a shadow, a picture on the floor.
     """
