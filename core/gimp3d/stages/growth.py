@@ -121,7 +121,8 @@ def find_growth(
     pieces = _components(within[(within >= 0).all(1)], len(grown))
     sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
     grown = grown[((sizes >= settings.least) & (likes > sizes / 2))[pieces]]
-    too_much = len(grown) > object_.sum()
+    outside = int((~in_region(region, points[grown])).sum())
+    too_much = outside > object_.sum() + len(grown) - outside
     if not len(grown) or too_much:
         return replace(none, endless=bool(too_much or (ours & endless & (cut >= settings.least)).any()))
     found = none.rows.copy()
