@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from mathutils import Euler, Matrix, Vector
 from scenes import BLOCK, REGION, cameras, scene
 
-from gimp3d.box import in_region
+from gimp3d.box import Box, in_region
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import write_png
@@ -170,8 +171,8 @@ def test_previews_lie_over_the_camera_one_at_a_time(splat: bpy.types.Object, tmp
     assert [s.image.name for s in slots] == ["000.png"]
 
 
-def test_a_proposed_box_is_taken_with_one_button(splat: bpy.types.Object, frame: Matrix) -> None:
-    splat.matrix_world = frame
+def test_a_proposed_box_is_taken_with_one_button(splat: bpy.types.Object) -> None:
+    splat.matrix_world = FRAME
     bpy.ops.gimp3d.add_roi()
     cube, settings = bpy.context.object, bpy.context.scene.gimp3d
     with pytest.raises(RuntimeError, match="no box is proposed"):
