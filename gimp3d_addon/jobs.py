@@ -133,6 +133,7 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         report=str(folder / "report"),
         summary=str(folder / "summary.json"),
         seed=settings.seed,
+        grow=settings.grow,
     )
     save_job(folder, job)
     return job

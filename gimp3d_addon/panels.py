@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from pathlib import Path
 
@@ -212,6 +213,11 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
             say(layout, f"Step {title[0]} first: {step.missing}", "ERROR")
             for fix in step.fixes[:1]:
                 button(layout, fix)
+        count = json.loads(settings.proposed or "{}").get("gaussians", 0)
+        if count:
+            say(layout, f"The box cuts the object: {count:,} splats of it stay", "INFO")
+            layout.operator("gimp3d.enlarge_roi", icon="FULLSCREEN_ENTER")
+        layout.prop(settings, "grow")
         row = layout.row(align=True)
         row.enabled = missing is None
         row.operator("gimp3d.preview_masks", icon="MOD_MASK")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 from bpy.props import (
+    BoolProperty,
     CollectionProperty,
     EnumProperty,
     FloatProperty,
@@ -63,6 +64,14 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         name="Picture",
         description="The reference view without the object, painted in any tool",
         subtype="FILE_PATH",
+    )
+    grow: BoolProperty(
+        name="Grow",
+        default=False,
+        description="Also remove what the box cut off of the object",
+    )
+    proposed: StringProperty(
+        name="Proposed", description="What the box cut off, as the last preview or removal found it (JSON)"
     )
     preset: EnumProperty(
         items=PRESETS, name="Preset", default="balanced", description="How much work is spent on the hole"

@@ -26,6 +26,7 @@ from .job import RemovalJob, load_job, save_job
 Namespace = argparse.Namespace
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
 IMAGES = "photos; none: views are rendered from the scene"
+GROW = "take along what of the object the boxes cut off"
 EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
 
 
@@ -63,6 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
     masks.add_argument("--roi", required=True)
     masks.add_argument("--out", required=True, metavar="DIR")
     masks.add_argument("--images", metavar="DIR|none", help=IMAGES)
+    masks.add_argument("--grow", action="store_true", help=GROW)
     masks.add_argument("--mode", choices=("need", "paper"), default="need")
     masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
     masks.add_argument(
@@ -81,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--roi")
     remove.add_argument("--out", metavar="OUT.ply")
     remove.add_argument("--images", metavar="DIR|none", help=IMAGES)
+    remove.add_argument("--grow", action="store_true", help=GROW)
     remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
     remove.add_argument(
         "--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)"
@@ -238,6 +241,7 @@ def _masks(given: Namespace, shown: Reporter) -> None:
         Path(given.out),
         images=given.images,
         mode=given.mode,
+        grow=given.grow,
         split=given.split,
         frames=_names(given.frames),
         extra_masks=Path(given.extra_masks) if given.extra_masks else None,

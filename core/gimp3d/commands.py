@@ -143,6 +143,7 @@ def write_masks(
     out: Path,
     images: str | None = None,  # folder; "none": views are rendered from the scene itself
     mode: str = "need",
+    grow: bool = False,
     split: str = "train",
     frames: Sequence[str] | None = None,
     extra_masks: Path | None = None,
@@ -154,8 +155,9 @@ def write_masks(
     """Write every view's target region as a 0/255 picture (CONTRACT: masks).
 
     With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
-    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one; and,
-    if the views are those that a removal would use, charts/, see `write_charts`.
+    the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one;
+    proposed.json, what of the object the boxes cut off, as in a removal's summary; and, if the views are those that a
+    removal would use, charts/, see `write_charts`.
     """
     _use_threads(threads)
     gaussians, region = read_scene(scene).gaussians, read_region(roi)
@@ -166,17 +168,20 @@ def write_masks(
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     loaded, _ = _load_views(looked_at, images, gaussians)
     photos = {v.camera.id: v.image for v in loaded}
+    settings = RemovalSettings(masks=MaskSettings(mode=mode, grow=grow), depth_prior=depth_prior)
     found = find_masks(
         gaussians,
         region,
         [v.camera for v in loaded],
-        MaskSettings(mode=mode),
+        settings.masks,
         progress,
         photos,
         _read_extra_masks(extra_masks, looked_at),
     )
-    settings = RemovalSettings(masks=MaskSettings(mode=mode), depth_prior=depth_prior)
     found, charts = with_charts(gaussians, region, found, photos, settings)
+    if pictures:
+        proposed = json.dumps(found.proposed)
+        write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
     if pictures and all(c.split == "train" for c in written):
         write_charts(pictures / "charts", charts)
     views = {v.camera.id: v for v in found.views}
@@ -268,6 +273,7 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
     if not 0 <= job.seed < 1 << 32:
         raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
     settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
+    settings = replace(settings, masks=replace(settings.masks, grow=job.grow))
     for key, text in job.set.items():
         settings = _with(settings, key.split("."), text, key)
     return settings
@@ -379,6 +385,7 @@ def _summary(
         },
         "verdict": asdict(result.verdict) if result.verdict else None,
         "selection": result.selection,
+        "proposed": result.proposed,
         "charts": [
             {
                 "kind": chart.kind,

@@ -43,6 +43,7 @@ class RemovalJob:
     device: str = "auto"
     threads: int | None = None
     seed: int = 0
+    grow: bool = False  # take along what of the object the boxes cut off
 
     PATHS = (
         *("scene", "cameras", "roi", "out", "images", "extra_masks"),

@@ -13,19 +13,20 @@ import numpy as np
 import scipy.ndimage
 
 from . import buffers
-from .box import Region
+from .box import Box, Region
 from .camera import Camera
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
 from .priors.inpaint import Appearance, inpaint_reference, paste_picture
 from .priors.monodepth import depth_prior
 from .progress import Progress, silent
-from .raster import RasterSettings, Window, drawing, render, surface_depth, touched_window
+from .raster import RasterSettings, Window, drawing, footprint, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_number, draw_charts, find_planes
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
+from .stages.growth import Growth
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
@@ -157,6 +158,7 @@ class RemovalResult:
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
     verdict: Verdict | None = None  # None where nothing was removed
+    proposed: dict[str, Any] = field(default_factory=dict)  # what of the object the boxes cut off, see Growth.facts
 
 
 class Store(Protocol):
@@ -234,6 +236,7 @@ def remove_object(
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
     run.warnings += masks.warnings
+    region = masks.grown(region)
     if not masks.removed.any():
         none = ["nothing to remove: the region holds no Gaussian"]
         return _finish(run, ~masks.removed, None, masks, (), {}, none)
@@ -255,6 +258,7 @@ def remove_object(
     run.pictures += [Picture("chart", f"What photos show of {c.camera.id}", c.image, (c.hole,)) for c in shown]
     keep = ~masks.removed
     kept = scene.take(keep)
+    run.pictures += _pictures_of_growth(scene, masks, photos)
 
     def judged(added: Gaussians | None, left: Sequence[ViewMasks], given: Reference | None) -> Verdict | None:
         seen = {v.camera.id for v in views if v.is_photo}
@@ -411,7 +415,7 @@ def with_charts(
     if settings.charts is None or masks.mode != "need" or not masks.removed.any():
         return masks, ()
     levelled = {name: e.image for name, e in _exposures(scene, masks, photos).items()}
-    charted = _chart(scene, region, masks, levelled, settings)
+    charted = _chart(scene, masks.grown(region), masks, levelled, settings)
     if not charted.charts:
         return masks, ()
     masks = replace(masks, selection=charted.selection, views=charted.targets.views)
@@ -929,6 +933,22 @@ def _spread(items: Sequence[R], count: int = 3) -> list[R]:
     return [items[k * len(items) // count] for k in range(min(count, len(items)))]
 
 
+def _pictures_of_growth(scene: Gaussians, masks: Masks, photos: Mapping[str, np.ndarray]) -> list[Picture]:
+    """What of the object the boxes cut off, in the two views that show most of it."""
+    if masks.growth is None or not masks.growth.rows.any():
+        return []
+    rows, title = masks.growth.rows, "Taken along" if masks.growth.taken else "Cut off by the box"
+    cut = scene.take(rows)
+
+    def shown(v: ViewMasks) -> np.ndarray:
+        window = window_mask(touched_window(cut, v.camera), v.camera)
+        return footprint(scene, v.camera, rows, pixels=window) > 0.25
+
+    found = zip(masks.views, parallel_map(shown, masks.views))
+    most = sorted(found, key=lambda pair: -int(pair[1].sum()))[:2]
+    return [Picture("mask", f"{title}, in {v.camera.id}", photos[v.camera.id], (mask,)) for v, mask in most]
+
+
 def _open_pixels(open_views: Sequence[ViewMasks]) -> int:
     return sum(int(v.target.sum()) for v in open_views)
 
@@ -965,15 +985,18 @@ def _finish(
         references=tuple(run.references),
         warnings=tuple(run.warnings + warnings),
         selection=masks.selection.counts,
+        proposed=masks.proposed,
     )
 
 
 # What a stage store has to know to bring results back.
 STORED = (
+    Box,
     Camera,
     Chart,
     Charted,
     Gaussians,
+    Growth,
     Hits,
     Masks,
     Plane,

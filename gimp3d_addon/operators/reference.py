@@ -84,7 +84,7 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
         "masks", job.scene, "--cameras", job.cameras, "--roi", job.roi, "--out", str(folder / "masks"),
         "--frames", job.reference, "--mode", mode, "--depth-prior", job.depth_prior,
         "--pictures", str(folder / "pictures"), "--progress", "json",
-        *(("--images", job.images) if job.images else ()),
+        *(("--images", job.images) if job.images else ()), *(("--grow",) if job.grow else ()),
     ]  # fmt: skip
     return Worker(arguments, python_of(context)), _stem(job.reference)
 
@@ -148,6 +148,7 @@ class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
         mask = backdrops.load_picture(folder / "masks" / f"{self._stem}.png", "mask")
         shown, pixels = mask, np.empty(4 * mask.size[0] * mask.size[1], np.float32)
         mask.pixels.foreach_get(pixels)
+        context.scene.gimp3d.proposed = (folder / "pictures" / "proposed.json").read_text(encoding="utf-8")
         context.scene.gimp3d.hole = f"{np.count_nonzero(pixels[::4] > 0.5):,} pixels in {self._camera}"
         for kind, title in PREVIEWS.items():
             drawn = folder / "pictures" / f"{self._stem}.{kind}.png"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import bpy
@@ -47,6 +48,7 @@ class RunsRemoval(RunsChild):
             settings.pace = (settings.pace * seconds / self._told) ** 0.5  # half-way: a busy minute is not forever
         report = self.folder / "report" / "index.html"
         settings.last_report = str(report) if report.exists() else ""
+        settings.proposed = json.dumps(summary["proposed"])
         for warning in summary["warnings"]:
             self.report({"WARNING"}, warning)
         verdict = summary["verdict"] or {"score": 1.0, "words": []}

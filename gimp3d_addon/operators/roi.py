@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty
-from mathutils import Matrix, Vector
+from mathutils import Matrix, Quaternion, Vector
 
+from gimp3d.box import Box
 from gimp3d.errors import BadInput
 
-from .. import splats
-from .base import ReportsErrors, current_splat, link, select_only
+from .. import bridge, splats
+from .base import ReportsErrors, current_boxes, current_splat, link, select_only
 
 FITS = (
     ("CURSOR", "At the 3D Cursor", "A cube at the 3D cursor (Shift + right click places it)", "PIVOT_CURSOR", 0),
@@ -166,4 +169,35 @@ class GIMP3D_OT_clear_rois(ReportsErrors, bpy.types.Operator):
         context.scene.gimp3d.rois.clear()
 
 
-CLASSES = (GIMP3D_OT_add_roi, GIMP3D_OT_use_selected, GIMP3D_OT_forget_roi, GIMP3D_OT_clear_rois)
+class GIMP3D_OT_enlarge_roi(ReportsErrors, bpy.types.Operator):
+    """Enlarge the box to hold what it cut off of the object, as the last preview or removal found it"""
+
+    bl_idname = "gimp3d.enlarge_roi"
+    bl_label = "Enlarge Box"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        settings, splat, cubes = context.scene.gimp3d, current_splat(context), current_boxes(context)
+        proposed = json.loads(settings.proposed or "{}").get("box")
+        if not proposed or splat is None or not cubes:
+            raise BadInput("no box is proposed; run Preview Mask or Remove Object first")
+        box = Box.make(**proposed)
+        frame = bridge.splat_frame(splat)
+        # the one that was enlarged lies within it
+        cut = min(cubes, key=lambda c: np.linalg.norm(bridge.box_from_blender(c, frame).center - box.center))
+        corners = np.array([tuple(c) for c in cut.bound_box])
+        low, size = corners.min(0), np.ptp(corners, axis=0)
+        turn = Quaternion(box.rotation_wxyz.tolist())
+        placed = Matrix.LocRotScale(Vector(box.center), turn, Vector(box.size))
+        unit = Matrix.LocRotScale(Vector(low + size / 2), None, Vector(size))
+        cut.matrix_world = Matrix(frame.tolist()) @ placed @ unit.inverted()
+        settings.proposed = ""
+
+
+CLASSES = (
+    GIMP3D_OT_add_roi,
+    GIMP3D_OT_use_selected,
+    GIMP3D_OT_forget_roi,
+    GIMP3D_OT_clear_rois,
+    GIMP3D_OT_enlarge_roi,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from mathutils import Euler, Matrix, Vector
 from scenes import BLOCK, REGION, cameras, scene
 
-from gimp3d.box import in_region
+from gimp3d.box import Box, in_region
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import write_png
@@ -168,3 +169,17 @@ def test_previews_lie_over_the_camera_one_at_a_time(splat: bpy.types.Object, tmp
     assert made == {f"3D-GIMP {title}" for title in ("view", "mask", "hole", "surface", "chart 1", "chart 1 hole")}
     bpy.ops.gimp3d.hide_previews()
     assert [s.image.name for s in slots] == ["000.png"]
+
+
+def test_a_proposed_box_is_taken_with_one_button(splat: bpy.types.Object) -> None:
+    splat.matrix_world = FRAME
+    bpy.ops.gimp3d.add_roi()
+    cube, settings = bpy.context.object, bpy.context.scene.gimp3d
+    with pytest.raises(RuntimeError, match="no box is proposed"):
+        bpy.ops.gimp3d.enlarge_roi()
+    wanted = Box.make([0.1, 0, 0.3], [0.9, 0.62, 0.7], [0.9, 0.1, 0.2, 0.3])
+    settings.proposed = json.dumps({"gaussians": 7, "box": wanted.to_json()})
+    assert bpy.ops.gimp3d.enlarge_roi() == {"FINISHED"} and settings.proposed == ""
+    bpy.context.view_layer.update()
+    box = bridge.box_from_blender(cube, bridge.splat_frame(splat))
+    assert np.allclose(box.corners(), wanted.corners(), atol=1e-4)

@@ -216,6 +216,24 @@ def test_a_painted_chart_rules_its_hole(scene_folder: Path, completed: Path, tmp
     assert (tmp_path / "out.ply").read_bytes() == first
 
 
+def test_what_the_box_cuts_is_proposed_and_grow_takes_it_along(scene_folder: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(scene_folder, tmp_path / "cut")
+    (folder / "roi.json").write_text(json.dumps({"center": [-0.08, 0, 0.26], "size": [0.46, 0.62, 0.56]}))
+    summaries = []
+    for name, more in (("plain", ()), ("grown", ("--grow",))):
+        remove(
+            folder, tmp_path / f"{name}.ply", "--preset", "draft", "--summary", str(tmp_path / f"{name}.json"), *more
+        )
+        summaries.append(json.loads((tmp_path / f"{name}.json").read_text()))
+    plain, grown = summaries
+    assert plain["proposed"]["gaussians"] > 100 and set(plain["proposed"]["box"]) == {"center", "size", "rotation_wxyz"}
+    assert any("--grow" in w for w in plain["warnings"]) and not any("--grow" in w for w in grown["warnings"])
+    assert grown["proposed"] == {"gaussians": 0, "box": None}
+    assert grown["selection"]["removed_grown"] == plain["proposed"]["gaussians"]
+    high = [int((read_ply(tmp_path / f"{n}.ply").gaussians.means[:, 2] > 0.3).sum()) for n in ("plain", "grown")]
+    assert high[1] < 0.1 * high[0]
+
+
 def test_extra_masks_are_filled_too(scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = cameras()[4]
     shadow = np.zeros((camera.height, camera.width), bool)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import drawing, render, touched_window
 from ..threads import parallel_map
+from .growth import NOTHING, Growth, GrowthSettings, find_growth
 from .outline import (
     Window,
     box_polygon,
@@ -79,6 +80,8 @@ class MaskSettings:
     least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
     least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
     selection: SelectionSettings = SelectionSettings()
+    grow: bool = False  # take along what of the object the boxes cut off
+    growth: GrowthSettings = GrowthSettings()
 
 
 @dataclass(frozen=True)
@@ -150,11 +153,21 @@ class Masks:
     confidence: float
     reason: str
     warnings: tuple[str, ...] = ()
+    growth: Growth | None = None  # what the boxes cut off; None if nothing was looked for (preset paper)
 
     @property
     def removed(self) -> np.ndarray:
         """[N] bool."""
         return self.selection.removed
+
+    @property
+    def proposed(self) -> dict[str, Any]:
+        """What else of the object there is, see Growth.facts."""
+        return self.growth.facts if self.growth else NOTHING
+
+    def grown(self, region: Region) -> Region:
+        """The boxes that hold what goes: larger ones if what they cut off goes too."""
+        return self.growth.region if self.growth and self.growth.taken else region
 
     @property
     def hole_pixels(self) -> int:
@@ -201,12 +214,12 @@ def find_masks(
     passes = _Passes(progress, 3 * len(seeing))
     before = passes.over(lambda c: _look(gaussians, c, polygons[c.id], photos or {}, extra or {}, settings), seeing)
     agreement = depth_agreement(seeing, [b.depth for b in before], [b.window for b in before], settings.depth_tolerance)
-    selection = by_centre(inside)
+    selection, growth = by_centre(inside), None
     if not settings.selection.by_centre:
         # Where views disagree on what they see, trainers have left that much more smears behind the object.
         lacking = max(0.0, settings.usual_agreement - agreement)
         rough = replace(settings.selection, support=settings.selection.support and settings.selection.support + lacking)
-        selection, before = _choose(gaussians, region, before, passes, rough)
+        selection, before, growth = _choose(gaussians, region, before, passes, replace(settings, selection=rough))
     gone = gaussians.take(selection.removed)
     after = passes.over(lambda b: _without(gaussians, gone, selection.removed, b, settings), before)
     centre = np.mean([box.center for box in region], axis=0)
@@ -227,7 +240,10 @@ def find_masks(
     share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
     confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
-    return Masks(selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), warnings)
+    told = [growth.words] if growth and growth.words else []
+    return Masks(
+        selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), (*warnings, *told), growth
+    )
 
 
 def _inconsistencies(before: Sequence[_Before], agreement: float, settings: MaskSettings) -> tuple[str, ...]:
@@ -334,17 +350,17 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _choose(
-    gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, settings: SelectionSettings
-) -> tuple[Selection, list[_Before]]:
-    """Which Gaussians go, by what the views show of them; and the views, with what else the user named masked out.
+    gaussians: Gaussians, region: Region, before: Sequence[_Before], passes: _Passes, masks: MaskSettings
+) -> tuple[Selection, list[_Before], Growth | None]:
+    """Which Gaussians go, by what views show of them; the views, what else the user named masked out; what was cut off.
 
     Where nothing stands out of the surface in a box, the surface itself is meant: a shadow, a picture on the floor.
     """
-    depths = [(b.camera, b.depth) for b in before]
+    settings, depths = masks.selection, [(b.camera, b.depth) for b in before]
     surroundings = [follow_surroundings(box, region, depths, settings.surroundings) for box in region]
     centre = by_centre(select_removed(gaussians, region))
     if all(box.size.max() < settings.least_cells * s.cell for box, s in zip(region, surroundings)):
-        return centre, list(before)  # pictures this small show no surface to follow
+        return centre, list(before), None  # pictures this small show no surface to follow
     seen = passes.over(lambda b: object_and_rim(b.camera, b.depth, region, surroundings, settings), before)
     members = [boxes_of(b.camera, np.where(o, b.depth, 0), region, surroundings) for b, (o, _) in zip(before, seen)]
     stands = standing(members, [int(_polygon_pixels(b).sum()) for b in before], settings.least_object)
@@ -357,7 +373,7 @@ def _choose(
 
     views = parallel_map(with_named, before) if named else list(before)
     if not objects:
-        return centre, views
+        return centre, views, None
 
     def sighting(view: _Before, object_: np.ndarray, ring: np.ndarray) -> Sighting:
         shows = np.full(object_.shape, Shows.CLEAR, np.uint8)
@@ -374,8 +390,11 @@ def _choose(
     if settings.support > 0:
         revealed = weigh_revealed(gaussians, selection, near, sightings)
         selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, settings)
+    growth = find_growth(gaussians, objects, selection, weights, depths, masks.growth)
+    fates = np.where(growth.rows & masks.grow, np.uint8(Fate.REMOVED_GROWN), selection.fates)
     alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
-    return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), selection.fates)), views
+    growth = replace(growth, region=growth.region + named, taken=masks.grow and growth.box is not None)
+    return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), fates)), views, growth
 
 
 def _without(

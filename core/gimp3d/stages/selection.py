@@ -35,6 +35,7 @@ class Fate(IntEnum):
     REMOVED_STRADDLING = 5  # goes: reaches in and shows on the object
     REMOVED_REVEALED = 6  # goes: near, and only the removal would show it
     REMOVED_MASKED = 7  # goes: shows under the extra masks
+    REMOVED_GROWN = 8  # goes: of the object, though the region cut it off
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ class Selection:
             f"{self.count(Fate.REMOVED_STRADDLING)} straddlers",
             f"{self.count(Fate.REMOVED_REVEALED)} that only the removal would show",
             f"{self.count(Fate.REMOVED_MASKED)} under extra masks",
+            f"{self.count(Fate.REMOVED_GROWN)} that the box cut off",
         ]
         stay = [
             f"{self.count(Fate.KEPT_SURFACE)} of floor or wall",

@@ -1,0 +1,169 @@
+"""What of the object the boxes cut off: its parts that go on outside them, and what looks like it on the surface.
+
+Gaussians that touch and have about the same colour are one part. A part that lies in the boxes to some share is the
+object's, so its rest is proposed. A part that the boxes hardly touch, or that goes on without end, is something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.csgraph
+from scipy.spatial import cKDTree
+
+from ..box import Box, Region, in_region
+from ..camera import Camera
+from ..gaussians import SH_C0, Gaussians
+from .selection import Fate, Selection, Weights
+from .surroundings import SurroundingsSettings, follow_surroundings
+
+
+@dataclass(frozen=True)
+class GrowthSettings:
+    """What belongs to an object that a box cuts."""
+
+    reach: float = 0.5  # how far from a box its rest may lie, as a share of the box's longest edge
+    touch: float = (
+        4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
+    )
+    colour: float = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
+    bins: int = 12  # of each channel in the histograms of the object's and the surroundings' colours
+    likely: float = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
+    unlikely: float = 0.1  # probability up to which one off the surface is something else
+    share: float = 0.1  # of a part's Gaussians that the boxes must hold
+    least: int = 10  # Gaussians of a piece that is worth proposing
+    shown: float = 0.5  # weight below which a Gaussian shows nothing
+    large: float = 0.25  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
+    surroundings: SurroundingsSettings = SurroundingsSettings(cells=200_000, views=20, beyond=0.1, seeds=0.05)
+
+
+NOTHING: dict[str, Any] = {"gaussians": 0, "box": None}  # proposed
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What the boxes cut off."""
+
+    rows: np.ndarray  # [N] bool: the object's, but kept
+    region: Region  # the boxes, one of them enlarged to hold these
+    box: Box | None  # that one; None if nothing was cut
+    taken: bool = False  # they go, and `region` counts
+    endless: bool = False  # a part of what the boxes cut goes on too far to be the object's rest
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """As in a removal's summary."""
+        if self.taken:
+            return NOTHING
+        return {"gaussians": int(self.rows.sum()), "box": self.box.to_json() if self.box else None}
+
+    @property
+    def words(self) -> str:
+        """The proposal for people; empty if there is none."""
+        if self.endless and self.box is None:
+            return "the box cuts something larger than what it holds: nothing is proposed; is the box too small?"
+        if self.box is None or self.taken:
+            return ""
+        size, centre = (", ".join(f"{v:.4g}" for v in values) for values in (self.box.size, self.box.center))
+        return (
+            f"the box cuts the object: {int(self.rows.sum())} Gaussians of it stay; "
+            f"use --grow or a box of size {size} at {centre}"
+        )
+
+
+def find_growth(
+    gaussians: Gaussians,
+    region: Region,  # boxes round the object
+    selection: Selection,
+    weights: Weights,  # whole as far round the boxes as `reach`, see selection.near_region
+    views: Sequence[tuple[Camera, np.ndarray]],  # (camera, z-depth [H, W] with the object, 0 = nothing)
+    settings: GrowthSettings = GrowthSettings(),
+) -> Growth:
+    """Which kept Gaussians are the object's, though the boxes or the surface under it kept them."""
+    none = Growth(np.zeros(len(gaussians), bool), region, None)
+    outer = tuple(_enlarged(box, settings.reach * box.size.max()) for box in region)
+    fates, longest = selection.fates, gaussians.scales.max(1)
+    of_object = (fates >= Fate.REMOVED_INSIDE) & (fates != Fate.REMOVED_MASKED)
+    small = longest < settings.large * min(box.size.min() for box in region)
+    shown = weights.object_ + weights.clear
+    there = gaussians.usable & (shown > settings.shown) & in_region(outer, gaussians.means.astype(np.float64))
+    rows = np.flatnonzero(there & (of_object | (small & (fates < Fate.REMOVED_INSIDE))))
+    points, object_ = gaussians.means[rows].astype(np.float64), of_object[rows]
+    if object_.sum() < settings.least or object_.all():
+        return none
+    on_surface = np.zeros(len(rows), bool)
+    for box in outer:
+        part = follow_surroundings(box, outer, views, settings.surroundings)
+        on_surface |= part.distance(points) <= part.cell + longest[rows]
+    colours = np.clip(0.5 + SH_C0 * gaussians.sh[rows, 0], 0, 1)
+    like = _likelihood(colours, shown[rows], object_ & ~on_surface, ~object_ & on_surface, settings.bins)
+    nodes = object_ | (like > np.where(on_surface, settings.likely, settings.unlikely))
+    rows, points, object_, colours, like = (a[nodes] for a in (rows, points, object_, colours, like))
+    tree = cKDTree(points[object_])
+    spacing = float(np.median(tree.query(points[object_], k=min(6, tree.n))[0][:, -1]))
+    radius = settings.touch * spacing
+    pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < settings.colour).all(1)]
+    parts = _components(pairs, len(rows))
+    held, cut = np.bincount(parts[object_], minlength=len(rows)), np.bincount(parts[~object_], minlength=len(rows))
+    known = in_region([_enlarged(box, -spacing) for box in outer], points)
+    endless = np.bincount(parts[~object_ & ~known], minlength=len(rows)) > 0
+    ours = held >= np.maximum(1, settings.share * (held + cut))
+    grown = np.flatnonzero((ours & ~endless)[parts] & ~object_)
+    renumbered = np.full(len(rows), -1)
+    renumbered[grown] = np.arange(len(grown))
+    within = renumbered[pairs]
+    pieces = _components(within[(within >= 0).all(1)], len(grown))
+    sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
+    grown = grown[((sizes >= settings.least) & (likes > sizes / 2))[pieces]]
+    outside = int((~in_region(region, points[grown])).sum())
+    too_much = outside > object_.sum() + len(grown) - outside
+    if not len(grown) or too_much:
+        return replace(none, endless=bool(too_much or (ours & endless & (cut >= settings.least)).any()))
+    found = none.rows.copy()
+    found[rows[grown]] = True
+    holding = [_holding(box, points[grown], radius) for box in region]
+    least = int(np.argmin([new.size.prod() - old.size.prod() for new, old in zip(holding, region)]))
+    return Growth(found, (*region[:least], holding[least], *region[least + 1 :]), holding[least])
+
+
+def _likelihood(
+    colours: np.ndarray,  # [M, 3] in [0, 1]
+    weights: np.ndarray,  # [M]
+    object_: np.ndarray,  # [M] bool, what is the object's for sure
+    surface: np.ndarray,  # [M] bool, what is mostly surface
+    bins: int,
+) -> np.ndarray:
+    """[M]: the probability by colour that a Gaussian is the object's, from smoothed histograms of both."""
+    index = np.minimum(colours * bins, bins - 1).astype(int) @ np.array([bins * bins, bins, 1])
+
+    def density(rows: np.ndarray) -> np.ndarray:
+        counts = np.bincount(index[rows], weights[rows], bins**3).reshape(bins, bins, bins)
+        return scipy.ndimage.gaussian_filter(counts / max(float(counts.sum()), 1e-9), 0.7).ravel()[index]
+
+    of_object, of_surface = density(object_), density(surface)
+    return of_object / np.maximum(of_object + of_surface, 1e-12)
+
+
+def _components(pairs: np.ndarray, count: int) -> np.ndarray:
+    """[count]: the number of each node's connected component, of the graph with edges [E, 2]."""
+    graph = scipy.sparse.coo_matrix((np.ones(len(pairs), bool), pairs.T), (count, count))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+
+
+def _enlarged(box: Box, by: float) -> Box:
+    """With every face moved outwards."""
+    return replace(box, size=np.maximum(box.size + 2 * by, 0))
+
+
+def _holding(box: Box, points: np.ndarray, margin: float) -> Box:
+    """The box, its faces moved outwards to hold points and a margin round those that it did not hold."""
+    local, half = (points - box.center) @ box.axes, box.size / 2
+    low = np.where(local.min(0) < -half, local.min(0) - margin, -half)
+    high = np.where(local.max(0) > half, local.max(0) + margin, half)
+    return replace(box, center=box.center + box.axes @ ((low + high) / 2), size=high - low)
