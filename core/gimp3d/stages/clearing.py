@@ -84,14 +84,11 @@ def clear_air(
     selection: Selection,
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
+    charts: Sequence[Chart],
     tolerance: float,
     settings: ClearingSettings = ClearingSettings(),
-    charts: Sequence[Chart] = (),
 ) -> Selection:
-    """Remove what only the removal reveals, where no photo shows that anything is; and rests of the object.
-
-    A rest stands on a texel whose picture shows the object though it lies beside the object's mask.
-    """
+    """Remove what only the removal reveals, where no photo shows that anything is; and rests of the object."""
     stays = ~selection.removed
     kept = scene.take(stays)
     near = near_region(scene, region, SelectionSettings(near=1.0))[stays]
@@ -106,8 +103,7 @@ def clear_air(
     means = scene.means[rows].astype(np.float64)
     for chart in charts:
         rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        height = chart.plane.local(means)[:, 2]
-        low = np.abs(height) < settings.low * extent(region)
+        low = np.abs(chart.plane.local(means)[:, 2]) < settings.low * extent(region)
         fates[rows[rest & low]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
@@ -154,10 +150,11 @@ def chart_targets(
         met = hits.depth > 0
         bare = met & (alpha_after < settings.solid)
         before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)
-        target = (unseen & (hidden | touched) & ~before) | (bare & (hidden | touched) & (view.alpha_before >= settings.solid))
+        gone_from = hidden | touched
+        target = gone_from & ((unseen & ~before) | (bare & (view.alpha_before >= settings.solid)))
         target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
-        target &= met & ~before & (hidden | touched) & ~view.occluder
+        target &= met & ~before & gone_from & ~view.occluder
         return replace(
             view,
             silhouette=hidden | witnesses[k].beside,

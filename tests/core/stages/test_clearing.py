@@ -83,10 +83,10 @@ def targets(plain: Removal, charts: tuple[Chart, ...]) -> Targets:
     return chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
 
 
-def cleared(removal: Removal, witnesses: list[Witness] | None = None) -> np.ndarray:
+def cleared(removal: Removal, witnesses: list[Witness] | None = None, charts: tuple[Chart, ...] = ()) -> np.ndarray:
     """Rows that clear_air removes on top of the selection's."""
     told = removal.witnesses if witnesses is None else witnesses
-    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, TOLERANCE)
+    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, charts, TOLERANCE)
     new = after.removed & ~removal.selection.removed
     assert (after.fates[new] == Fate.REMOVED_REVEALED).all()
     np.testing.assert_array_equal(after.fates[~new], removal.selection.fates[~new])
@@ -104,6 +104,23 @@ def test_photos_show_the_object_where_its_gaussians_draw(plain: Removal) -> None
             for dx in (-1, 0, 1):
                 near[np.clip(rows + dy, 0, 119), np.clip(cols + dx, 0, 159)] = True
         assert not (witness.hidden | witness.beside)[~near].any()
+
+
+def test_rests_on_texels_that_show_the_object_go(charts: tuple[Chart, ...]) -> None:
+    """Low ones, that is: what stands high above may be another thing, and beside the texels nothing is touched."""
+    beside = np.array([0.45, 0.0])
+    given = removal(specks([[*beside, 0.02], [*beside, 0.6], [-0.45, 0.0, 0.02]]))
+    (chart,) = charts
+    uv, _ = chart.camera.project(np.array([[*beside, 0.0]]))
+    col, row = uv[0].astype(int)
+    rests = np.zeros_like(chart.rests)
+    rests[row - 3 : row + 4, col - 3 : col + 4] = True
+    before = set(cleared(given, charts=(replace(chart, rests=np.zeros_like(rests)),)))
+    new = set(cleared(given, charts=(replace(chart, rests=rests),))) - before
+    low, high, elsewhere = range(len(given.scene) - 3, len(given.scene))
+    assert low in new and high not in new and elsewhere not in new
+    x, y = given.scene.means[sorted(new), :2].T
+    assert np.abs([x - beside[0], y - beside[1]]).max() < 0.1
 
 
 def test_haze_within_the_object_goes_and_what_photos_see_stays() -> None:
