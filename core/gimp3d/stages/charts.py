@@ -112,7 +112,7 @@ class Chart:
     known: np.ndarray  # bool, photos show it, and much the same
     hole: np.ndarray  # bool, the object hides it in some photos, and none shows it, or they show its rests
     below: np.ndarray  # bool, known only from what the object's rough mask covers
-    rests: np.ndarray  # bool, part of the hole: photos show the object there, though beside its mask
+    rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
     agreement: float  # of the photos round the hole, see Textures
     noise: float  # median distance of the views' drawn surfaces from it, scene units
     tolerance: float  # relative z within which a view's drawn surface is this one
@@ -396,7 +396,7 @@ def _chart(
     touched = cv2.dilate(object_.astype(np.uint8), np.ones((2 * MIXED + 1,) * 2, np.uint8)) > 0
     free = hole & ~touched & (hiding > 1) & (spread_below <= limit) & ~_marked(surface, witnesses, marked, hole.shape)
     free = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
-    rests = object_ & ~hole
+    rests = object_ & (photos > 0)
     hole = (hole & ~free) | rests
     photos[free], known = hiding[free], (known | free) & ~hole
     image[hole] = 0
