@@ -151,7 +151,7 @@ def chart_targets(
         bare = met & (alpha_after < settings.solid)
         before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)
         gone_from = hidden | touched
-        target = gone_from & ((unseen & ~before) | (bare & (view.alpha_before >= settings.solid)))
+        target = (hidden & unseen & ~before) | (gone_from & bare & (view.alpha_before >= settings.solid))
         target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
         target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
         target &= met & ~before & gone_from & ~view.occluder

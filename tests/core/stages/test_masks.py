@@ -215,7 +215,7 @@ def test_the_worse_views_agree_the_more_photos_must_vouch_for_what_is_revealed(
     asked = []
 
     def choose(*given: object) -> object:
-        asked.append(given[-1])
+        asked.append(given[-1])  # the settings
         return chosen(*given)
 
     chosen = stage._choose
@@ -223,7 +223,7 @@ def test_the_worse_views_agree_the_more_photos_must_vouch_for_what_is_revealed(
     monkeypatch.setattr(stage, "depth_agreement", lambda *_: agreement)
     find_masks(scene(), REGION, cameras())
     find_masks(scene(), REGION, cameras(), MaskSettings(selection=SelectionSettings(support=0)))
-    assert [a.support for a in asked] == pytest.approx([support, 0])
+    assert [a.selection.support for a in asked] == pytest.approx([support, 0])
 
 
 def test_constant_photos_say_nothing() -> None:
