@@ -291,7 +291,8 @@ def remove_object(
     of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
     as_photo = not charts or reference is not None or of_view
     numbers = range(len(charts))
-    turns: list[int | None] = [*[None] * (as_photo * (1 + settings.extra_references)), *numbers]
+    photos_in_turn = 1 if charts else 1 + settings.extra_references
+    turns: list[int | None] = [*[None] * (as_photo * photos_in_turn), *numbers]
     if named is not None:
         turns = [named, *(k for k in numbers if k != named)]
         if settings.depth_prior != "auto":
@@ -330,6 +331,7 @@ def remove_object(
                     suffix,
                     filled,
                     open_views,
+                    charts,
                     hits,
                     levelled,
                     painted,
@@ -500,19 +502,6 @@ def _fill_from_chart(
     run.warnings += appearance.warnings
     source = ~target & ~hole & chart.known
 
-    def to_paint(v: ViewMasks, _: Gaussians) -> ViewToPaint:
-        name, there = v.camera.id, hits[v.camera.id].depth
-        behind = (v.depth_after == 0) | (v.depth_after > (1 - chart.tolerance) * there)
-        return ViewToPaint(
-            v.camera,
-            photos[name],
-            painted[name],
-            v.silhouette,
-            v.target,
-            snapped(v.depth_before, there, chart.tolerance),
-            np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, chart.tolerance)),
-        )
-
     return _carried(
         run,
         suffix,
@@ -523,10 +512,21 @@ def _fill_from_chart(
         source,
         filled,
         open_views,
-        to_paint,
+        lambda v, _: _on_charts(v, hits[v.camera.id], chart.tolerance, photos, painted),
         painted,
         settings,
     )
+
+
+def _on_charts(
+    v: ViewMasks, hits: Hits, tolerance: float, photos: Mapping[str, np.ndarray], painted: Mapping[str, np.ndarray]
+) -> ViewToPaint:
+    """The view with the charts for its depth, where its own is theirs or none."""
+    name, there = v.camera.id, hits.depth
+    behind = (v.depth_after == 0) | (v.depth_after > (1 - tolerance) * there)
+    after = np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, tolerance))
+    before = snapped(v.depth_before, there, tolerance)
+    return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, before, after)
 
 
 def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
@@ -615,7 +615,8 @@ def _fill_from_one_view(
     suffix: str,
     filled: Gaussians,  # the scene so far, without the object
     open_views: Sequence[ViewMasks],
-    hits: dict[str, Hits],  # where charts are; empty without them
+    charts: Sequence[Chart],
+    hits: dict[str, Hits],  # where they are; empty without them
     photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
     painted: dict[str, np.ndarray],  # without it, as far as that is known
     settings: RemovalSettings,
@@ -634,6 +635,8 @@ def _fill_from_one_view(
         lambda: _complete_depth(view, open_views, hits, painted[view.camera.id], settings, given, first=not suffix),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
+    if charts:
+        depth = snapped(depth, hits[view.camera.id].depth, max(c.tolerance for c in charts)).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
@@ -647,6 +650,8 @@ def _fill_from_one_view(
 
     def to_paint(v: ViewMasks, with_seeds: Gaussians) -> ViewToPaint:
         name = v.camera.id
+        if charts:
+            return _on_charts(v, hits[name], max(c.tolerance for c in charts), photos, painted)
         window = near_hole(v.target, settings.propagate)
         depth_new = np.zeros_like(v.depth_before)
         if v.target.any():

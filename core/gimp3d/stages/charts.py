@@ -5,9 +5,10 @@ A chart's picture is made of all photos with the object left out; what no photo 
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -33,6 +34,11 @@ UNLIKE = 3.0  # times what photos of the surface differ by, from which they show
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
 SOFT = 8  # texels round a hole that may show some of the object
+LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
+POINTS = 96  # along a side, at which photos are compared at the finest level
+SWEEP = 25  # offsets of a plane that are tried
+TRIED = 3  # planes of the coarsest level that are followed up
+STEP = 0.01  # the first of a pattern search
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 
 
@@ -52,7 +58,8 @@ class ChartSettings:
     inlier: float = 0.03  # distance up to which such a point lies on a plane
     least: float = 0.1  # share of the points that a plane must hold
     most: int = 4  # planes that are tried: a floor, two walls, and one that rough depths make up
-    search: float = 0.12  # how far photos may move a plane along its normal
+    search: float = 0.12  # how far photos may move a plane along its normal, to begin with
+    tilt: float = 0.2  # slope by which they may tilt it, to begin with
     precise: float = 1e-4  # to what it is settled
     rival: float = 1.1  # how much better photos must agree on a plane of its own than on a better one, for its points
     relief: float = 0.9  # share of what photos disagree on, on the plane, that a relief may leave
@@ -174,7 +181,8 @@ def find_planes(
     """
     diagonal = extent(region)
     around = _surface_round(views, witnesses, region, settings)
-    textures = Textures.make(witnesses)
+    levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
+    textures = levels[-1]
     cameras = np.array([v.camera.centre for v in views])
     rng, left = np.random.default_rng(0), around
     found: list[tuple[float, Plane, _Round]] = []
@@ -184,11 +192,11 @@ def find_planes(
             break
         point, normal, on = candidate
         facing = normal if np.median((cameras - point) @ normal) > 0 else -normal
-        plane = _settled(Plane.make(point, facing, region), diagonal, textures, settings)
+        plane = _settled(Plane.make(point, facing, region), diagonal, levels, settings)
         own = left.take(on)
         found.append((float(textures.agreement(own.on(plane))), plane, own))
         left = left.take(~on)
-    found.sort(key=lambda f: -f[0] * f[2].weight.sum())
+    found.sort(key=lambda f: -textures.agreement(around.on(f[1])))
     planes: list[Plane] = []
     for told, plane, own in found:
         if not planes or told >= settings.rival * max(textures.agreement(own.on(p)) for p in planes):
@@ -278,27 +286,52 @@ def _grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def _settled(plane: Plane, half: float, textures: Textures, settings: ChartSettings) -> Plane:
-    """The plane where photos agree best: a sweep along the normal, then a pattern search with tilts (Hooke 1961)."""
-    x, y = _grid(half, 160)
+def _settled(plane: Plane, half: float, levels: Sequence[Textures], settings: ChartSettings) -> Plane:
+    """The plane where photos agree best (plane sweep, then a pattern search with tilts: Hooke 1961), coarse to fine.
 
-    def agreement(at: np.ndarray) -> float:
-        height = at[0] + (at[1] * x + at[2] * y) / half
-        return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+    Coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a compromise of
+    several surfaces: the fine level also starts from a sweep of its own.
+    """
+    sweep = np.linspace(-1, 1, SWEEP) * settings.search
+    tilts = (-settings.tilt, 0.0, settings.tilt)
+    starts = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
+    for level, textures in enumerate(levels):
+        finest = level == len(levels) - 1
+        x, y = _grid(half, POINTS // 2 ** (len(levels) - 1 - level))
 
-    offsets = np.linspace(-1, 1, 25) * settings.search * half
-    told = [agreement(np.array([o, 0, 0])) for o in offsets]
-    at, best = np.array([offsets[int(np.argmax(told))], 0, 0]), max(told)
-    step = 0.01 * half
-    while step > settings.precise * half:
-        moves = [at + step * s * np.eye(3)[k] * (1 if k == 0 else 2) for k in range(3) for s in (1, -1)]
+        def agreement(at: np.ndarray, x: np.ndarray = x, y: np.ndarray = y, textures: Textures = textures) -> float:
+            height = at[0] * half + at[1] * x + at[2] * y
+            return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+
+        def best_of(starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+            told = [agreement(s) for s in starts]
+            return [starts[k] for k in np.argsort(told)[::-1][:count]]
+
+        if level == 0:
+            starts = best_of(starts, TRIED)
+        if finest:
+            starts = [*starts, *best_of([np.array([o, 0.0, 0.0]) for o in sweep], 1)]
+        least = settings.precise if finest else STEP / 4
+        found = [_climbed(agreement, start, STEP, least) for start in starts]
+        starts = [max(found, key=lambda f: f[0])[1]]
+    offset, slope_x, slope_y = starts[0]
+    return plane.tilted(offset * half, slope_x, slope_y)
+
+
+def _climbed(
+    agreement: Callable[[np.ndarray], float], start: np.ndarray, step: float, least: float
+) -> tuple[float, np.ndarray]:
+    """The greatest value near a start, and where it is: pattern search down to a step."""
+    at, best = start, agreement(start)
+    while step > least:
+        moves = [at + step * sign * np.eye(3)[k] * (1 if k == 0 else 2) for k in range(3) for sign in (1, -1)]
         told = [agreement(m) for m in moves]
         k = int(np.argmax(told))
         if told[k] > best:
             at, best = moves[k], told[k]
         else:
             step /= 2
-    return plane.tilted(at[0], at[1] / half, at[2] / half)
+    return best, at
 
 
 def _chart(

@@ -112,19 +112,25 @@ class Textures:
     values: np.ndarray  # int8, band-passed luminance of all views; −128 where it is hidden
 
     @classmethod
-    def make(cls, witnesses: Sequence[Witness], most: int = 32) -> Textures:
-        """Of `most` views, evenly chosen."""
+    def make(cls, witnesses: Sequence[Witness], most: int = 32, shrink: int = 1) -> Textures:
+        """Of `most` views, evenly chosen, in pictures smaller by a whole factor."""
         count = min(len(witnesses), most)
         used = [witnesses[k * len(witnesses) // count] for k in range(count)]
 
-        def of(witness: Witness) -> np.ndarray:
+        def of(witness: Witness) -> tuple[np.ndarray, np.ndarray]:
             hidden = witness.hidden | witness.beside  # the object's edge is no texture of what is beside it
-            return np.where(hidden, np.int8(-128), texture(witness.photo, ~hidden)).ravel()
+            h, w = (n // shrink for n in hidden.shape)
+            whole = slice(0, h * shrink), slice(0, w * shrink)
+            photo = cv2.resize(witness.photo[whole], (w, h), interpolation=cv2.INTER_AREA)
+            hidden = hidden[whole].reshape(h, shrink, w, shrink).any((1, 3))
+            camera = pack(witness.camera)
+            camera[12:16] /= shrink
+            camera[16:] = w, h
+            return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
 
-        values = parallel_map(of, used)
+        cameras, values = zip(*parallel_map(of, used))
         sizes = np.array([len(v) for v in values], np.int64)
-        cameras = np.array([pack(w.camera) for w in used])
-        return cls(cameras, np.cumsum(sizes) - sizes, np.concatenate(values))
+        return cls(np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
 
     def agreement(
         self,
