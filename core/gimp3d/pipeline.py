@@ -291,8 +291,7 @@ def remove_object(
     of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
     as_photo = not charts or reference is not None or of_view
     numbers = range(len(charts))
-    photos_in_turn = 1 if charts else 1 + settings.extra_references
-    turns: list[int | None] = [*[None] * (as_photo * photos_in_turn), *numbers]
+    turns: list[int | None] = [*[None] * (as_photo * (1 + settings.extra_references)), *numbers]
     if named is not None:
         turns = [named, *(k for k in numbers if k != named)]
         if settings.depth_prior != "auto":
@@ -512,21 +511,46 @@ def _fill_from_chart(
         source,
         filled,
         open_views,
-        lambda v, _: _on_charts(v, hits[v.camera.id], chart.tolerance, photos, painted),
+        lambda v, _: _on_charts(v, hits[v.camera.id], [chart], photos, painted),
         painted,
         settings,
     )
 
 
+def _rough(charts: Sequence[Chart], settings: RemovalSettings) -> bool:
+    """The views' drawn surfaces scatter about the charts by more than a z-test allows."""
+    return any(c.scatter > settings.propagate.depth_tolerance for c in charts)
+
+
 def _on_charts(
-    v: ViewMasks, hits: Hits, tolerance: float, photos: Mapping[str, np.ndarray], painted: Mapping[str, np.ndarray]
+    v: ViewMasks,
+    hits: Hits,
+    charts: Sequence[Chart],
+    photos: Mapping[str, np.ndarray],
+    painted: Mapping[str, np.ndarray],
 ) -> ViewToPaint:
     """The view with the charts for its depth, where its own is theirs or none."""
     name, there = v.camera.id, hits.depth
+    tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
     behind = (v.depth_after == 0) | (v.depth_after > (1 - tolerance) * there)
-    after = np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, tolerance))
-    before = snapped(v.depth_before, there, tolerance)
+    after = np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, scatter))
+    before = snapped(v.depth_before, there, scatter)
     return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, before, after)
+
+
+def _as_drawn(
+    v: ViewMasks,
+    with_seeds: Gaussians,
+    photos: Mapping[str, np.ndarray],
+    painted: Mapping[str, np.ndarray],
+    settings: RemovalSettings,
+) -> ViewToPaint:
+    """The view with the depth of its splats, the new ones among them."""
+    name, depth_new = v.camera.id, np.zeros_like(v.depth_before)
+    if v.target.any():
+        window = window_mask(near_hole(v.target, settings.propagate), v.camera)
+        depth_new = surface_depth(with_seeds, v.camera, pixels=window)[0]
+    return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
 
 
 def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
@@ -635,8 +659,8 @@ def _fill_from_one_view(
         lambda: _complete_depth(view, open_views, hits, painted[view.camera.id], settings, given, first=not suffix),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
-    if charts:
-        depth = snapped(depth, hits[view.camera.id].depth, max(c.tolerance for c in charts)).astype(np.float32)
+    if _rough(charts, settings):
+        depth = snapped(depth, hits[view.camera.id].depth, max(c.scatter for c in charts)).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{suffix}",
         lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
@@ -649,14 +673,9 @@ def _fill_from_one_view(
     ]
 
     def to_paint(v: ViewMasks, with_seeds: Gaussians) -> ViewToPaint:
-        name = v.camera.id
-        if charts:
-            return _on_charts(v, hits[name], max(c.tolerance for c in charts), photos, painted)
-        window = near_hole(v.target, settings.propagate)
-        depth_new = np.zeros_like(v.depth_before)
-        if v.target.any():
-            depth_new = surface_depth(with_seeds, v.camera, pixels=window_mask(window, v.camera))[0]
-        return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
+        if _rough(charts, settings):
+            return _on_charts(v, hits[v.camera.id], charts, photos, painted)
+        return _as_drawn(v, with_seeds, photos, painted, settings)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
     completed_reference, new, painting = _carried(

@@ -50,7 +50,7 @@ def learn_change(
         return NO_CHANGE
     x, y = _within_places(colours, places, weights), _within_places(change, places, weights)
     matrix = _fit(x, y, weights, weights, ridge, ROUNDS)
-    kept = weights * _biweight(y - x @ matrix)
+    kept = weights * biweight(y - x @ matrix)
     slopes = (kept[:, None] * x * y).sum(0) / ((kept[:, None] * x * x).sum(0) + LEAST_NOISE**2 * kept.sum() + 1e-9)
     explained, wanted = [], []
     for place in np.unique(places):
@@ -59,7 +59,7 @@ def learn_change(
             continue
         without = _fit(x[~here], y[~here], weights[~here], kept[~here], ridge, MORE_ROUNDS)
         predicted = x[here] @ without
-        counted = (weights[here] * _biweight(y[here] - predicted))[:, None]
+        counted = (weights[here] * biweight(y[here] - predicted))[:, None]
         explained.append((counted * predicted * y[here]).sum())
         wanted.append((counted * predicted**2).sum())
     trust = 0.0
@@ -113,11 +113,14 @@ def _fit(
     for _ in range(rounds):
         scaled = x * kept[:, None]
         matrix = np.linalg.solve(scaled.T @ x + (ridge * kept.sum() + 1e-9) * np.eye(x.shape[1]), scaled.T @ y)
-        kept = weights * _biweight(y - x @ matrix)
+        kept = weights * biweight(y - x @ matrix)
     return matrix
 
 
-def _biweight(residuals: np.ndarray) -> np.ndarray:
+def biweight(
+    residuals: np.ndarray,  # [N, 3] grey levels
+) -> np.ndarray:
+    """[N] in [0, 1]: how much each counts (Tukey's biweight, scaled by their median length)."""
     squares = np.einsum("nc,nc->n", residuals, residuals)
     scale = CUT * (1.4826 * np.sqrt(np.median(squares)) + LEAST_NOISE)
     return np.maximum(0.0, 1 - squares / scale**2) ** 2

@@ -122,7 +122,8 @@ class Chart:
     rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
     agreement: float  # of the photos round the hole, see Textures
     noise: float  # median distance of the views' drawn surfaces from it, scene units
-    tolerance: float  # relative z within which a view's drawn surface is this one
+    scatter: float  # relative z by which the views' drawn surfaces scatter about it
+    tolerance: float  # the same, but never very small: within it a drawn surface is this one
     reason: str
 
 
@@ -404,7 +405,8 @@ def _chart(
                 depth, surface, agreement = sunk
     before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
     # what lies behind a wall says nothing of how the floor's depths scatter
-    tolerance = _tolerance(surface[before] if before.sum() > TELLING else surface, witnesses, settings)
+    scatter = _scatter(surface[before] if before.sum() > TELLING else surface, witnesses, settings)
+    tolerance = max(settings.tolerance, scatter)
     said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
     hole, there = _unseen(said), _there(said)
     hole &= there
@@ -447,6 +449,7 @@ def _chart(
         rests,
         agreement,
         noise,
+        scatter,
         tolerance,
         words,
     )
@@ -485,7 +488,7 @@ def _marked(
     return found.reshape(shape)
 
 
-def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:
+def _scatter(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:
     """How far, relative to z, the views' drawn surfaces scatter about this one: three standard deviations."""
     some = surface[:: max(1, len(surface) // 5000)]
     off = []
@@ -499,7 +502,7 @@ def _tolerance(surface: np.ndarray, witnesses: Sequence[Witness], settings: Char
         off.append(front[shown] / z[framed][shown] - 1)
     all_ = np.abs(np.concatenate(off)) if off else np.zeros(0)
     spread = 3 * 1.4826 * float(np.median(all_)) if len(all_) else 0.0
-    return float(np.clip(spread, settings.tolerance, 4 * settings.tolerance))
+    return min(spread, 4 * settings.tolerance)
 
 
 def _unseen(said: np.ndarray) -> np.ndarray:

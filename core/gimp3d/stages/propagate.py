@@ -18,7 +18,7 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
-from ..solvers.colours import NO_CHANGE, ColourChange, exposure_gain, learn_change
+from ..solvers.colours import NO_CHANGE, ColourChange, biweight, exposure_gain, learn_change
 from ..solvers.poisson import solve_poisson
 from ..threads import at_once, parallel_map, run_ranges
 
@@ -31,7 +31,8 @@ MOST_PATCHES = 2000  # of the mapped sources
 SMOOTHING = 1 / 20  # of the reach: half the side of the square that pairs are means of, against misregistration
 LEAST_BAND = 20  # px that tell a part's level
 HOLD = 1 / 16  # how strongly a correction is held at its level where the band is far, over the band's own weight's root
-BAND = 1 / 8  # of the reach: the strip round the hole that the blend is fitted to
+BAND = 1 / 8  # of the reach: the strip round the hole that the blend is fitted to most
+FAR = 4  # times as far away, photo still tells
 SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -291,7 +292,7 @@ def _paint(mapped: _Map, view: ViewToPaint, lent: Sequence[_Lent], settings: Pro
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth, settings)
     else:
         width = BAND * reach
-        blended = blend_band(base, raw, painted, photo & (distance <= width), width, depth, change.offset, settings)
+        blended = blend_band(base, raw, painted, photo, width, depth, change.offset, settings)
     rules[near.target & evidence] = Rule.EVIDENCE
     rows, cols = _bounds(near.target, 0)
     return PaintedView(
@@ -607,7 +608,7 @@ def blend_band(
     raw: np.ndarray,  # [H, W, 3] float32, the fill, in the hole and in the band
     painted: np.ndarray,  # [H, W] bool, where the fill is to be seen
     band: np.ndarray,  # [H, W] bool, photo round the hole that the fill must fit
-    width: float,  # px of the band: the correction follows the photo over about as much
+    width: float,  # px over which the correction follows the photo; farther away it counts less
     depth: np.ndarray,  # [H, W] z of the new scene
     offset: np.ndarray,  # [3] level of parts that no band touches
     settings: PropagateSettings,
@@ -615,18 +616,24 @@ def blend_band(
     """The fill with a smooth correction c that fits it to the band, [H, W, 3] uint8.
 
     Minimises Σ |∇c|² + Σ_band w (c − mismatch)² + h Σ (c − level)²: Poisson blending (guidance: the fill's gradients)
-    with a soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole. The
-    weak hold h lets what few pixels say fade with the distance. Depth seams stop the correction.
+    with a soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole: all
+    photo round it is asked, and w is less where it is farther away, and where the mismatch is not like most. The weak
+    hold h lets what few pixels say fade with the distance. Depth seams stop the correction.
     """
     result = base.copy()
     if not painted.any():
         return result
-    whole = painted | band
+    distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5)
+    near = distance <= FAR * width
+    whole = near & (painted | band | (depth > 0))  # the correction passes what lies between
     domain = whole & ~_behind_seams(whole, depth, settings.seam)
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
     level = _levels(domain, data, mismatch, offset)
-    weight, hold = 2 / width**2 * data, (HOLD / width) ** 2
+    weight, hold = 2 / width**2 * np.zeros(data.shape), (HOLD / width) ** 2
+    if data.any():  # where the two show different things, the difference is none of light
+        nearness = 1 / (1 + (distance[data] / width) ** 2)
+        weight[data] = 2 / width**2 * nearness * biweight((mismatch - level)[data])
     anchor = (weight[..., None] * mismatch + hold * level) / (weight + hold)[..., None]
     correction = solve_poisson(
         domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=weight + hold, anchor=anchor

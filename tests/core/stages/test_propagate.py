@@ -214,7 +214,7 @@ def test_exposure_is_met_where_the_hole_touches_no_photo(reference: Reference) -
     hole = target.target & (rules != Rule.UNREACHED)
     assert error(image, target, hole, darker) < 8
     _, unlearned, _ = paint(reference, replace(target, silhouette=grown), PropagateSettings(transfer="none"))
-    assert error(unlearned, target, hole, darker) > 20
+    assert error(unlearned, target, hole, darker) > 12  # the photo beyond the renderings alone is too far away
 
 
 def test_change_that_depends_on_the_material_is_learned(reference: Reference) -> None:
@@ -464,7 +464,7 @@ def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
     with mock.patch.object(stage, "solve_poisson", wraps=stage.solve_poisson) as solver:
         blended = blend_band(base, raw, painted, band, width, np.ones((h, w)), np.zeros(3), PropagateSettings())
     (domain, *_), system = solver.call_args
-    assert (domain == (painted | band)).all()
+    assert (domain == (cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) <= stage.FAR * width)).all()
     correction = np.zeros(base.shape)
     correction[domain] = solved_directly(domain, **system)
     expected = np.clip(np.rint(raw + correction), 0, 255)
@@ -481,3 +481,27 @@ def test_what_few_pixels_of_photo_say_fades_with_the_distance() -> None:
     band[19:21, 1] = True  # a hundredth of the hole's outline
     blended = blend_band(base, raw, painted, band, 4.0, np.ones((40, 120)), np.zeros(3), PropagateSettings())
     assert blended[20, 2, 0] > 70 and blended[20, 115, 0] < 66
+
+
+def test_photo_that_shows_something_else_does_not_colour_the_fill() -> None:
+    base = np.full((60, 60, 3), 120, np.uint8)
+    raw = np.full(base.shape, 100.0, np.float32) + np.random.default_rng(0).normal(0, 2, base.shape).astype(np.float32)
+    painted = np.zeros((60, 60), bool)
+    painted[20:40, 20:40] = True
+    other = np.zeros_like(painted)
+    other[18:42, 42:50] = True  # a blue thing that stands elsewhere in the reference's picture
+    raw[other] = [20, 30, 180]
+    blended = blend_band(base, raw, painted, ~painted, 3.0, np.ones((60, 60)), np.zeros(3), PropagateSettings())
+    assert np.abs(blended[painted].mean(0) - 120).max() < 2
+
+
+def test_where_hardly_any_photo_touches_the_hole_what_lies_farther_away_tells_its_level() -> None:
+    base = np.full((80, 80, 3), 150, np.uint8)
+    raw = np.full(base.shape, 130.0, np.float32)
+    painted = np.zeros((80, 80), bool)
+    painted[30:50, 30:50] = True
+    band = np.zeros_like(painted)
+    band[:15], band[51, 30:34] = True, True
+    base[51, 30:34] = 180  # a few pixels beside it show the object's edge
+    blended = blend_band(base, raw, painted, band, 4.0, np.ones((80, 80)), np.zeros(3), PropagateSettings())
+    assert np.abs(blended[painted].mean(0) - 150).max() < 3
