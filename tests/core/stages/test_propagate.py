@@ -464,7 +464,7 @@ def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
     with mock.patch.object(stage, "solve_poisson", wraps=stage.solve_poisson) as solver:
         blended = blend_band(base, raw, painted, band, width, np.ones((h, w)), np.zeros(3), PropagateSettings())
     (domain, *_), system = solver.call_args
-    assert (domain == (cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5) <= stage.FAR * width)).all()
+    assert (domain == (stage.cv2.distanceTransform((~painted).astype(np.uint8), 2, 5) <= stage.FAR * width)).all()
     correction = np.zeros(base.shape)
     correction[domain] = solved_directly(domain, **system)
     expected = np.clip(np.rint(raw + correction), 0, 255)
