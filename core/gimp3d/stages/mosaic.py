@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ..jit import exact_kernel
+from ..jit import exact_kernel, inline_kernel
 from ..threads import parallel_map, run_ranges
 from .witness import Says, Witness, texture
 
 SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say
 FEW = 12.0  # grey levels by which a photo may always differ from what most say
+LOUD = 3.0  # times the spread of textures, by which its detail may besides: more is the edge of something before it
 
 
 def mosaic(
@@ -27,9 +28,10 @@ def mosaic(
     differs between photos on any surface, but things that do not lie on it also show another texture in each.
 
     Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
-    decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time: the one
-    with most pixels there of those that agree with the median. Between photos only detail changes, so that no seam
-    shows (two bands of Burt & Adelson 1983). 0 where no photo shows the surface.
+    decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time, brought
+    to the median's colours by a smooth correction: the one with most pixels there of those that need little of it.
+    Between photos only detail changes, so that no seam shows (two bands of Burt & Adelson 1983). 0 where no photo
+    shows the surface.
     """
     h, w = points.shape[:2]
     clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do
@@ -49,15 +51,19 @@ def mosaic(
 
     parts = parallel_map(of, range(len(witnesses)))
     samples, textures, density = (np.array([p[k] for p in parts]) for k in range(3))
-    common, best = np.zeros((2, h * w, 3), np.float32)
-    spread = np.zeros(h * w, np.float32)
-    run_ranges(_choose_range, h * w, samples, textures, density, FEW, common, best, spread)
-    common, best = common.reshape(h, w, 3), best.reshape(h, w, 3)
-    shown = (density > 0).any(0).reshape(h, w)
-    detail = best - _smooth(best, shown)
-    picture = np.where(shown[..., None], np.clip(np.rint(_smooth(common, shown) + detail), 0, 255), 0)
+    middle, spread = np.zeros((h * w, 3), np.float32), np.zeros(h * w, np.float32)
+    run_ranges(_agree_range, h * w, samples, textures, density, middle, spread)
     several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
-    return picture.astype(np.uint8), _smooth(spread.reshape(h, w, 1), several)[..., 0]
+    spread = _smooth(spread.reshape(h, w, 1), several)
+
+    def correction(k: int) -> np.ndarray:
+        off = _smooth((middle - samples[k]).reshape(h, w, 3), told[k])
+        return np.clip(np.rint(off), -128, 127).astype(np.int8).reshape(-1, 3)
+
+    corrections = np.array(parallel_map(correction, range(len(witnesses))))
+    picture = middle.copy()
+    run_ranges(_choose_range, h * w, samples, corrections, density, middle, FEW, FEW + LOUD * spread.ravel(), picture)
+    return np.clip(np.rint(picture), 0, 255).reshape(h, w, 3).astype(np.uint8), spread[..., 0]
 
 
 def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -67,42 +73,49 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 @exact_kernel
-def _choose_range(lo, hi, samples, textures, density, few, common, best, spread):
-    views = len(samples)
-    values = np.empty(views)
+def _agree_range(lo, hi, samples, textures, density, middle, spread):
+    values = np.empty(len(samples))
     for i in range(lo, hi):
         count = 0
         for channel in range(3):
             count = 0
-            for k in range(views):
+            for k in range(len(samples)):
                 if density[k, i] > 0:
                     values[count] = samples[k, i, channel]
                     count += 1
             if count:
                 part = np.sort(values[:count])
-                common[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
+                middle[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
         if count == 0:
             continue
         count = 0
-        for k in range(views):
+        for k in range(len(samples)):
             if density[k, i] > 0:
                 values[count] = textures[k, i]
                 count += 1
         part = np.sort(values[:count])
         spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
-        off, least, largest = 0.0, 1e9, 0.0
-        for k in range(views):  # the nearest to the median always agrees
+
+
+@exact_kernel
+def _choose_range(lo, hi, samples, corrections, density, middle, few, loud, picture):
+    for i in range(lo, hi):
+        least, largest = 127.0, 0.0
+        for k in range(len(samples)):  # the nearest to the median always agrees
             if density[k, i] > 0:
-                off = 0.0
+                least = min(least, _most(corrections, k, i))
+        for k in range(len(samples)):
+            if not density[k, i] > largest or _most(corrections, k, i) > max(few, least):
+                continue
+            off = 0.0
+            for channel in range(3):
+                off = max(off, abs(samples[k, i, channel] + corrections[k, i, channel] - middle[i, channel]))
+            if off <= loud[i]:
+                largest = density[k, i]
                 for channel in range(3):
-                    off = max(off, abs(samples[k, i, channel] - common[i, channel]))
-                least = min(least, off)
-        for k in range(views):
-            if density[k, i] > largest:
-                off = 0.0
-                for channel in range(3):
-                    off = max(off, abs(samples[k, i, channel] - common[i, channel]))
-                if off <= max(few, least):
-                    largest = density[k, i]
-                    for channel in range(3):
-                        best[i, channel] = samples[k, i, channel]
+                    picture[i, channel] = samples[k, i, channel] + corrections[k, i, channel]
+
+
+@inline_kernel
+def _most(corrections, k, i):
+    return max(abs(float(corrections[k, i, 0])), abs(float(corrections[k, i, 1])), abs(float(corrections[k, i, 2])))
