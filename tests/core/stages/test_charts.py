@@ -13,7 +13,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.orbit import look_at
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find_planes, first_hits
-from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.masks import ViewMasks, sees
 from gimp3d.stages.witness import Says, Witness, ask
 
 FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset
@@ -194,12 +194,73 @@ def test_a_surface_that_nothing_hides_has_no_chart(floor_room: Room) -> None:
     assert draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, clear, REGION) == ()
 
 
+def area(chart: Chart, mask: np.ndarray) -> float:
+    """Of a chart's texels, square scene units."""
+    return float(mask.sum()) * (chart.depth[0, 0] / chart.camera.fx) ** 2
+
+
+TOO_WIDE = 16  # px; a ring of some ten texels or less stays hole
+
+
+@pytest.fixture(scope="module")
+def wide(floor_room: Room) -> list[Witness]:
+    """Masks too large on all sides: below them photos show floor."""
+    side = 2 * TOO_WIDE + 1
+    masks = [cv2.dilate(w.hidden.astype(np.uint8), np.ones((side, side))) > 0 for w in floor_room.witnesses]
+    return [replace(w, hidden=m, beside=w.beside & ~m) for w, m in zip(floor_room.witnesses, masks)]
+
+
+@pytest.fixture(scope="module")
+def wide_chart(floor_room: Room, wide: list[Witness]) -> Chart:
+    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, wide, REGION)
+    return chart
+
+
+def test_of_a_mask_that_is_too_large_little_more_than_the_object_stays_hole(
+    floor_chart: Chart, wide: list[Witness], wide_chart: Chart
+) -> None:
+    c = wide_chart
+    true = area(floor_chart, floor_chart.hole)
+    assert area(c, unseen(c, wide)) > 3 * true  # as far as the masks tell
+    assert area(c, c.hole) < 1.5 * true  # measured: 1.28
+    certain = hidden_everywhere(EYES, texels(c), 0.0).reshape(c.hole.shape)
+    assert certain.sum() > 500 and c.hole[certain].all()
+    assert (c.below & unseen(c, wide)).sum() > 2000 and (c.known & (c.photos > 1))[c.below].all()
+    assert not (c.below & c.hole).any()
+    assert np.abs(c.image[c.below] - texture(texels(c)).reshape(c.image.shape)[c.below]).max() < 20  # floor, not red
+
+
+def test_what_photos_disagree_on_below_the_mask_stays_hole(
+    floor_room: Room, wide: list[Witness], wide_chart: Chart
+) -> None:
+    """Though it has the floor's colours: each photo shows another part of the floor there."""
+    other = [
+        replace(w, photo=np.where((w.hidden & ~narrow.hidden)[..., None], w.photo[::-1], w.photo))
+        for w, narrow in zip(wide, floor_room.witnesses)
+    ]
+    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, other, REGION)
+    assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
+
+
+def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
+    floor_room: Room, wide: list[Witness], wide_chart: Chart
+) -> None:
+    left = np.arange(240) < 120
+    marks = [w.hidden & left & (k == 0) for k, w in enumerate(wide)]  # in one view
+    plane = Plane.make(np.zeros(3), UP, REGION)
+    (chart,) = draw_charts([plane], floor_room.views, wide, REGION, ChartSettings(), marks)
+    on = sees(EYES[0], marks[0], texels(chart), np.inf).reshape(chart.hole.shape)
+    assert (wide_chart.below & on).sum() > 500 and chart.hole[wide_chart.below & on].all()
+    apart = cv2.dilate(on.astype(np.uint8), np.ones((17, 17))) == 0
+    assert (wide_chart.below & apart).sum() > 500
+    np.testing.assert_array_equal(chart.hole[apart], wide_chart.hole[apart])
+
+
 def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:
     plane = Plane.make(np.zeros(3), UP, REGION)
     small = draw_charts([plane], floor_room.views, floor_room.witnesses, REGION, ChartSettings(largest=50))[0]
     assert max(small.camera.width, small.camera.height) in (50, 51)
-    area = [c.hole.sum() * (c.camera.fx / c.depth[0, 0]) ** -2 for c in (small, floor_chart)]
-    assert area[0] == pytest.approx(area[1], rel=0.05)
+    assert area(small, small.hole) == pytest.approx(area(floor_chart, floor_chart.hole), rel=0.05)
 
 
 LOW, HIGH = (0.7, 1.2, 1.9), (1.6, 2.2, 2.8)
