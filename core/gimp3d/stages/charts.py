@@ -335,6 +335,36 @@ def _climbed(
     return best, at
 
 
+@dataclass(frozen=True)
+class _Surface:
+    """Where a chart's surface lies; arrays of its camera."""
+
+    kind: str  # plane | relief
+    depth: np.ndarray  # [H, W] float32 z
+    points: np.ndarray  # [H, W, 3] scene coordinates
+    agreement: float
+    reason: str
+    noise: float = np.nan  # see Chart
+
+    @property
+    def texels(self) -> np.ndarray:
+        """[H·W, 3] scene coordinates."""
+        return self.points.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What photos show of a surface, as far as the object's masks tell; arrays [H, W]."""
+
+    there: np.ndarray  # bool
+    image: np.ndarray  # [H, W, 3] uint8; in the hole it is what they show below the masks
+    photos: np.ndarray  # uint16, how many show it
+    hiding: np.ndarray  # uint16, in how many the object's mask covers it
+    known: np.ndarray  # bool
+    hole: np.ndarray  # bool
+    alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
+
+
 def _chart(
     plane: Plane,
     others: Sequence[Plane],  # that it may meet
@@ -345,114 +375,174 @@ def _chart(
     textures: Textures,
     settings: ChartSettings,
 ) -> Chart | None:
-    diagonal = extent(region)
-    x, y = _grid(2 * diagonal, 200)
-    said = ask(witnesses, plane.points(x, y).reshape(-1, 3), settings.tolerance).reshape(-1, 200, 200)
-    hole = _unseen(said)
-    labels, _ = scipy.ndimage.label(hole)
-    near = np.hypot(x, y) < diagonal
-    hole &= np.isin(labels, np.unique(labels[near & hole]))
-    if not hole.any():
+    """The chart at a plane; None if the object hides nothing of it, or no view faces what it hides."""
+    placed = _placed(plane, region, views, witnesses, settings)
+    if placed is None:
         return None
-    cell = 4 * diagonal / 200
-    low, high = (np.array([x[hole], y[hole]]).min(1) - cell, np.array([x[hole], y[hole]]).max(1) + cell)
-    centre, size = (low + high) / 2, high - low
-    size = np.minimum(size + 2 * np.maximum(0.75 * size.max(), 0.15 * diagonal), 4 * diagonal)
-    # a texel is a pixel of the views that show this place best
-    places = plane.points(*centre[:, None])
-    density = []
-    for v in views:
-        _, z = v.camera.project(places)
-        cosine = float(((v.camera.centre - places[0]) @ plane.normal) / np.linalg.norm(v.camera.centre - places[0]))
-        if z[0] > 0 and cosine > 0:
-            density.append(v.camera.fx * v.camera.fy * cosine / z[0] ** 2)
-    if not density:
+    camera, away = placed
+    surface = _surface(camera, away, plane, region, views, witnesses, textures, settings)
+    scatter = _scatter(surface.texels, others, witnesses, settings)
+    tolerance = max(settings.tolerance, scatter)
+    shown = _shown(surface.points, plane, witnesses, tolerance)
+    below, rests = _told_by_colours(
+        shown,
+        _object_colours(plane, witnesses, tolerance),
+        in_region(region, surface.texels).reshape(surface.depth.shape),
+        _marked(surface.texels, witnesses, marked, surface.depth.shape),
+    )
+    hole = (shown.hole & ~below) | rests
+    return Chart(
+        camera,
+        plane,
+        surface.kind,
+        surface.depth,
+        shown.there,
+        image=np.where(hole[..., None], np.uint8(0), shown.image),
+        photos=np.where(below, shown.hiding, shown.photos),
+        known=(shown.known | below) & ~hole,
+        hole=hole,
+        below=below,
+        rests=rests,
+        agreement=surface.agreement,
+        noise=surface.noise,
+        scatter=scatter,
+        tolerance=tolerance,
+        reason=surface.reason,
+    )
+
+
+def _placed(
+    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], settings: ChartSettings
+) -> tuple[Camera, float] | None:
+    """The camera that faces what the object hides of a plane, and the plane's z there; None if there is none."""
+    part = _hidden_part(plane, region, witnesses, settings)
+    if part is None:
         return None
-    texel = 1 / math.sqrt(float(np.percentile(density, 90)))
+    centre, size = part
+    place = plane.points(*centre[:, None])[0]
+    texel = _pixel_size(place, plane.normal, views)
+    if not math.isfinite(texel):
+        return None
     texel = max(texel, float(size.max()) / settings.largest)
     width, height = (int(n) for n in np.ceil(size / texel))
     away = 4 * float(np.linalg.norm(size))
     rotation = np.stack([plane.right, plane.down, -plane.normal])
     if np.linalg.det(rotation) < 0:
         rotation[1] *= -1
-    eye = places[0] + away * plane.normal
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART)
-    depth = np.full((height, width), away, np.float32)
-    kind, noise = "plane", np.nan
-    surface = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)).reshape(-1, 3)
-    agreement = textures.agreement(surface)
-    drawn = _drawn_surface(camera, depth, plane, views, witnesses, settings, diagonal)
-    words = f"photos agree by {agreement:.2f}"
-    if drawn is not None:
-        noise = float(np.median(np.abs(drawn.offset[drawn.known])))
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (place + away * plane.normal)
+    return Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART), away
 
-        def moved(offset: np.ndarray | float) -> tuple[np.ndarray, np.ndarray, float]:
-            z = (depth + offset).astype(np.float32)
-            points = camera.unproject(camera.pixel_centres(), z.astype(np.float64)).reshape(-1, 3)
-            return z, points, textures.agreement(points)
 
-        as_relief = moved(drawn.completed)
-        words = f"photos agree by {agreement:.2f} on the plane, {as_relief[2]:.2f} on the relief"
-        if 1 - as_relief[2] < settings.relief * (1 - agreement):
-            kind, (depth, surface, agreement) = "relief", as_relief
-        else:
-            # splats are drawn a little behind the surface that they show: new ones must lie where they do
-            near = drawn.offset[drawn.known & (np.abs(drawn.offset) < SINKS * diagonal)]
-            sunk = moved(float(np.median(near)) if len(near) > TELLING else 0.0)
-            if sunk[2] >= settings.sunk * agreement:
-                depth, surface, agreement = sunk
-    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
-    # what lies behind a wall says nothing of how the floor's depths scatter
-    scatter = _scatter(surface[before] if before.sum() > TELLING else surface, witnesses, settings)
-    tolerance = max(settings.tolerance, scatter)
-    said = ask(witnesses, surface, tolerance).reshape(-1, height, width)
-    hole, there = _unseen(said), _there(said)
-    hole &= there
-    points = surface.reshape(height, width, 3)
+def _hidden_part(
+    plane: Plane, region: Region, witnesses: Sequence[Witness], settings: ChartSettings, count: int = 200
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The rectangle of a plane that holds what the object hides and a margin to fill it from: centre, size [2] each.
+
+    What is hidden is sought on a grid of `count` places along a side. None if nothing is.
+    """
+    diagonal = extent(region)
+    x, y = _grid(2 * diagonal, count)
+    said = ask(witnesses, plane.points(x, y).reshape(-1, 3), settings.tolerance).reshape(-1, count, count)
+    hole = _unseen(said)
+    labels, _ = scipy.ndimage.label(hole)
+    near = np.hypot(x, y) < diagonal
+    hole &= np.isin(labels, np.unique(labels[near & hole]))
+    if not hole.any():
+        return None
+    cell = 4 * diagonal / count
+    low, high = (np.array([x[hole], y[hole]]).min(1) - cell, np.array([x[hole], y[hole]]).max(1) + cell)
+    size = high - low
+    size = np.minimum(size + 2 * np.maximum(0.75 * size.max(), 0.15 * diagonal), 4 * diagonal)
+    return (low + high) / 2, size
+
+
+def _pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
+    """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
+    density = []
+    for v in views:
+        _, z = v.camera.project(place[None])
+        cosine = float(((v.camera.centre - place) @ normal) / np.linalg.norm(v.camera.centre - place))
+        if z[0] > 0 and cosine > 0:
+            density.append(v.camera.fx * v.camera.fy * cosine / z[0] ** 2)
+    return 1 / math.sqrt(float(np.percentile(density, 90))) if density else math.inf
+
+
+def _surface(
+    camera: Camera,
+    away: float,  # z of the plane
+    plane: Plane,
+    region: Region,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    settings: ChartSettings,
+) -> _Surface:
+    """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
+    flat = np.full((camera.height, camera.width), away, np.float32)
+
+    def at(offset: np.ndarray | float, kind: str) -> _Surface:
+        depth = (flat + offset).astype(np.float32)
+        points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64))
+        agreement = textures.agreement(points.reshape(-1, 3))
+        return _Surface(kind, depth, points, agreement, f"photos agree by {agreement:.2f}")
+
+    level = at(0.0, "plane")
+    drawn = _drawn_surface(camera, flat, plane, views, witnesses, settings, extent(region))
+    if drawn is None:
+        return level
+    relief = at(drawn.completed, "relief")
+    if 1 - relief.agreement < settings.relief * (1 - level.agreement):
+        chosen = relief
+    else:
+        # splats are drawn a little behind the surface that they show: new ones must lie where they do
+        near = drawn.offset[drawn.known & (np.abs(drawn.offset) < SINKS * extent(region))]
+        sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
+        chosen = sunk if sunk.agreement >= settings.sunk * level.agreement else level
+    return replace(
+        chosen,
+        reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
+        noise=float(np.median(np.abs(drawn.offset[drawn.known]))),
+    )
+
+
+def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
+    """What photos show at points [H, W, 3] of a surface."""
+    said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
+    there = _there(said)
+    hole = _unseen(said) & there
     image, spread = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
     limit = _usual_spread(spread[there & (photos > 1) & ~hole])
     alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & (hiding > photos)
-
-    # the object's mask is rough: where photos agree below it, and on the surface's colours, they show the surface
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
     below, spread_below = mosaic(points, plane.normal, witnesses, beneath)
-    image[hole] = below[hole]
     known = alike & there & (photos > 1) & ~hole
-    far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    inside = in_region(region, surface).reshape(height, width)
-    doubtful = hole | (there & (photos + hiding > 0) & (inside | (far < SOFT)))
-    around = known & ~doubtful & (far < math.sqrt(hole.sum()))
-    object_ = shows_object(image, doubtful, hole, _object_colours(plane, witnesses, tolerance), image[around])
+    image = np.where(hole[..., None], below, image)
+    return _Shown(there, image, photos, hiding, known, hole, spread_below <= limit)
+
+
+def _told_by_colours(
+    shown: _Shown,
+    object_colours: np.ndarray,  # [N, 3] uint8
+    inside: np.ndarray,  # [H, W] bool, texels in the region
+    marked: np.ndarray,  # [H, W] bool, texels that are filled whatever photos show
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there.
+
+    Where photos agree below it, and on the surface's colours, they show the surface.
+    """
+    s = shown
+    far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
+    doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
+    around = s.known & ~doubtful & (far < math.sqrt(s.hole.sum()))
+    object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
     touched = cv2.dilate(object_.astype(np.uint8), np.ones((2 * MIXED + 1,) * 2, np.uint8)) > 0
-    free = hole & ~touched & (hiding > 1) & (spread_below <= limit) & ~_marked(surface, witnesses, marked, hole.shape)
-    free = cv2.morphologyEx(free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
-    rests = object_ & (photos > 0)
-    hole = (hole & ~free) | rests
-    photos[free], known = hiding[free], (known | free) & ~hole
-    image[hole] = 0
-    return Chart(
-        camera,
-        plane,
-        kind,
-        depth,
-        there,
-        image,
-        photos,
-        known,
-        hole,
-        free,
-        rests,
-        agreement,
-        noise,
-        scatter,
-        tolerance,
-        words,
-    )
+    below = (s.hole & ~touched & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
+    below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
+    return below, object_ & (s.photos > 0)
 
 
 def _usual_spread(spread: np.ndarray) -> float:
@@ -488,8 +578,16 @@ def _marked(
     return found.reshape(shape)
 
 
-def _scatter(surface: np.ndarray, witnesses: Sequence[Witness], settings: ChartSettings) -> float:
+def _scatter(
+    surface: np.ndarray,  # [N, 3]
+    others: Sequence[Plane],  # that it may meet
+    witnesses: Sequence[Witness],
+    settings: ChartSettings,
+) -> float:
     """How far, relative to z, the views' drawn surfaces scatter about this one: three standard deviations."""
+    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
+    # what lies behind a wall says nothing of how the floor's depths scatter
+    surface = surface[before] if before.sum() > TELLING else surface
     some = surface[:: max(1, len(surface) // 5000)]
     off = []
     for witness in witnesses:

@@ -153,7 +153,7 @@ class Masks:
     confidence: float
     reason: str
     warnings: tuple[str, ...] = ()
-    growth: Growth | None = None  # what the boxes cut off; None if nothing was looked for (preset paper)
+    growth: Growth | None = None  # what the boxes cut off; None if nothing was looked for, as in the preset paper
 
     @property
     def removed(self) -> np.ndarray:
@@ -241,6 +241,8 @@ def find_masks(
     reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
     confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
     told = [growth.words] if growth and growth.words else []
+    if settings.grow and growth is None:
+        told = ["--grow does nothing here: the boxes alone tell what goes, as always in the preset paper"]
     return Masks(
         selection, views, left_out, mode, confidence, "; ".join([*warnings, reason]), (*warnings, *told), growth
     )

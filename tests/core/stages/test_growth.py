@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
@@ -12,7 +13,7 @@ from scenes import BLOCK, REGION, block, cameras, floor, scene
 
 from gimp3d.box import Box, Region
 from gimp3d.gaussians import SH_C0, Gaussians
-from gimp3d.pipeline import render_bytes
+from gimp3d.pipeline import PRESETS, render_bytes
 from gimp3d.stages.growth import Growth
 from gimp3d.stages.masks import Masks, MaskSettings, find_masks
 from gimp3d.stages.selection import Fate
@@ -63,6 +64,16 @@ def test_grow_takes_the_rest_along() -> None:
     assert grown.proposed == {"gaussians": 0, "box": None} and not grown.warnings
     assert grown.grown(CUT)[0].size[0] > CUT[0].size[0] and plain.grown(CUT) == CUT
     assert grown.hole_pixels > plain.hole_pixels
+
+
+@pytest.mark.parametrize("grow", [False, True])
+def test_grow_warns_where_the_boxes_alone_tell_what_goes(grow: bool) -> None:
+    """In the preset paper, and where a box holds nothing but floor."""
+    paper = replace(PRESETS["paper"].masks, grow=grow)
+    bare = (Box.make([0.7, 0.7, 0], [0.5, 0.5, 0.1]),)
+    for masks in (find_masks(scene(), CUT, VIEWS, paper), found(scene(), bare, grow)):
+        assert masks.removed.any() and masks.growth is None
+        assert len(masks.warnings) == grow and all("--grow does nothing" in w for w in masks.warnings)
 
 
 def test_a_box_that_holds_the_object_proposes_nothing() -> None:
