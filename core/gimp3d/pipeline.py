@@ -456,8 +456,8 @@ def _chart(
     charts = draw_charts(planes, views, witnesses, region, settings.charts, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
-    tolerance = max(c.tolerance for c in charts)
-    selection = clear_air(scene, region, masks.selection, views, witnesses, charts, max(c.scatter for c in charts), settings.clearing)
+    tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
+    selection = clear_air(scene, region, masks.selection, views, witnesses, charts, scatter, settings.clearing)
     targets = chart_targets(scene, selection, views, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     cleared = int(selection.removed.sum() - masks.removed.sum())

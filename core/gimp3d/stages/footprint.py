@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 SAMPLES = 128  # colours of each kind, squared, that the two models are made of
 
 
@@ -23,7 +24,9 @@ def shows_object(
     if not doubtful.any() or not len(object_colours) or not len(surface_colours):
         return doubtful & presumed
     rng = np.random.default_rng(0)
-    certain = [c[rng.integers(0, len(c), (SAMPLES, SAMPLES))] for c in (object_colours, surface_colours)]
+    drawn = (c[rng.integers(0, len(c), (SAMPLES, SAMPLES))] for c in (object_colours, surface_colours))
+    # a colour without any spread would be a model that nothing else fits, however near
+    certain = [np.clip(c + rng.normal(0, GRAIN, c.shape), 0, 255).astype(np.uint8) for c in drawn]
     labels = np.repeat(np.array([cv2.GC_FGD, cv2.GC_BGD], np.uint8), SAMPLES)[:, None].repeat(SAMPLES, 1)
     labels[[0, -1], [0, -1]] = cv2.GC_PR_FGD, cv2.GC_PR_BGD  # it refuses to work where nothing is in doubt
     models = np.zeros((2, 1, 65))
