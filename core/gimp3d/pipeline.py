@@ -302,42 +302,20 @@ def remove_object(
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
-        suffix = "" if first else f" {round_ + 1}"
+        so_far = _SoFar("" if first else f" {round_ + 1}", filled, open_views, charts, hits, levelled, painted)
         try:
             if number is not None:
-                step = _fill_from_chart(
-                    run,
-                    suffix,
-                    _carried_over(charts[number], done),
-                    number,
-                    filled,
-                    open_views,
-                    hits,
-                    levelled,
-                    painted,
-                    settings,
-                    number == named,
-                    reference_image if number == named else None,
-                )
+                given = reference_image if number == named else None
+                chart = _carried_over(charts[number], done)
+                step = _fill_from_chart(run, so_far, chart, number, settings, number == named, given)
                 if step is None:
                     if number == named:
                         run.warnings.append(f"--reference {reference}: no view needs this chart, it is not used")
                     continue
                 completed, new, painting = step
             else:
-                completed, new, painting = _fill_from_one_view(
-                    run,
-                    suffix,
-                    filled,
-                    open_views,
-                    charts,
-                    hits,
-                    levelled,
-                    painted,
-                    settings,
-                    reference if first else None,
-                    reference_image if first else None,
-                )
+                wanted, given = (reference, reference_image) if first else (None, None)
+                completed, new, painting = _fill_from_one_view(run, so_far, settings, wanted, given)
         except IllPosed as error:
             touched = sum(int(v.silhouette.sum()) for v in masks.views)
             if first and masks.hole_pixels > NEGLIGIBLE * touched:
@@ -464,22 +442,30 @@ def _chart(
     return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
 
 
+@dataclass(frozen=True)
+class _SoFar:
+    """How far the removal has come when a reference is to be completed."""
+
+    suffix: str  # of the stages' names
+    filled: Gaussians  # the scene without the object, the new Gaussians in it
+    views: Sequence[ViewMasks]  # what is open of them
+    charts: Sequence[Chart]
+    hits: dict[str, Hits]  # by ID, where charts are; empty without them
+    photos: dict[str, np.ndarray]  # by ID, with the object, at the splats' exposure
+    painted: dict[str, np.ndarray]  # by ID, without it, as far as that is known
+
+
 def _fill_from_chart(
     run: _Run,
-    suffix: str,
+    so_far: _SoFar,
     chart: Chart,
     number: int,  # its index
-    filled: Gaussians,
-    open_views: Sequence[ViewMasks],
-    hits: dict[str, Hits],
-    photos: dict[str, np.ndarray],
-    painted: dict[str, np.ndarray],
     settings: RemovalSettings,
     named: bool = False,  # the user's reference
     given: np.ndarray | None = None,  # [H, W, 3] uint8, its picture
 ) -> tuple[Reference, Gaussians, Propagation] | None:
     """Complete one chart, carry it into every view, and make its Gaussians; None if no view needs it."""
-    target, hole = _texels_to_fill(chart, number, open_views, hits)
+    target, hole = _texels_to_fill(chart, number, so_far.views, so_far.hits)
     if not target.any():
         return None
 
@@ -497,22 +483,19 @@ def _fill_from_chart(
             ~chart.known & ~hole,
         )
 
-    appearance: Appearance = run(f"appearance{suffix}", complete)
+    appearance: Appearance = run(f"appearance{so_far.suffix}", complete)
     run.warnings += appearance.warnings
     source = ~target & ~hole & chart.known
 
     return _carried(
         run,
-        suffix,
+        so_far,
         chart.camera,
         appearance,
         chart.depth,
         target,
         source,
-        filled,
-        open_views,
-        lambda v, _: _on_charts(v, hits[v.camera.id], [chart], photos, painted),
-        painted,
+        lambda v, _: _on_charts(v, so_far, [chart]),
         settings,
     )
 
@@ -522,35 +505,25 @@ def _rough(charts: Sequence[Chart], settings: RemovalSettings) -> bool:
     return any(c.scatter > settings.propagate.depth_tolerance for c in charts)
 
 
-def _on_charts(
-    v: ViewMasks,
-    hits: Hits,
-    charts: Sequence[Chart],
-    photos: Mapping[str, np.ndarray],
-    painted: Mapping[str, np.ndarray],
-) -> ViewToPaint:
+def _on_charts(v: ViewMasks, so_far: _SoFar, charts: Sequence[Chart]) -> ViewToPaint:
     """The view with the charts for its depth, where its own is theirs or none."""
-    name, there = v.camera.id, hits.depth
+    name = v.camera.id
+    there = so_far.hits[name].depth
     tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
     behind = (v.depth_after == 0) | (v.depth_after > (1 - tolerance) * there)
     after = np.where(v.target & (there > 0) & behind, there, snapped(v.depth_after, there, scatter))
     before = snapped(v.depth_before, there, scatter)
-    return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, before, after)
+    return ViewToPaint(v.camera, so_far.photos[name], so_far.painted[name], v.silhouette, v.target, before, after)
 
 
-def _as_drawn(
-    v: ViewMasks,
-    with_seeds: Gaussians,
-    photos: Mapping[str, np.ndarray],
-    painted: Mapping[str, np.ndarray],
-    settings: RemovalSettings,
-) -> ViewToPaint:
+def _as_drawn(v: ViewMasks, so_far: _SoFar, with_seeds: Gaussians, settings: RemovalSettings) -> ViewToPaint:
     """The view with the depth of its splats, the new ones among them."""
-    name, depth_new = v.camera.id, np.zeros_like(v.depth_before)
+    name, after = v.camera.id, np.zeros_like(v.depth_before)
     if v.target.any():
         window = window_mask(near_hole(v.target, settings.propagate), v.camera)
-        depth_new = surface_depth(with_seeds, v.camera, pixels=window)[0]
-    return ViewToPaint(v.camera, photos[name], painted[name], v.silhouette, v.target, v.depth_before, depth_new)
+        after = surface_depth(with_seeds, v.camera, pixels=window)[0]
+    photo, painted = so_far.photos[name], so_far.painted[name]
+    return ViewToPaint(v.camera, photo, painted, v.silhouette, v.target, v.depth_before, after)
 
 
 def _carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
@@ -636,34 +609,30 @@ def _refined(
 
 def _fill_from_one_view(
     run: _Run,
-    suffix: str,
-    filled: Gaussians,  # the scene so far, without the object
-    open_views: Sequence[ViewMasks],
-    charts: Sequence[Chart],
-    hits: dict[str, Hits],  # where they are; empty without them
-    photos: dict[str, np.ndarray],  # with the object, at the splats' exposure
-    painted: dict[str, np.ndarray],  # without it, as far as that is known
+    so_far: _SoFar,
     settings: RemovalSettings,
-    wanted: str | None,
-    given: np.ndarray | None,
+    wanted: str | None,  # ID of the reference; None chooses
+    given: np.ndarray | None,  # [H, W, 3] uint8, its picture
 ) -> tuple[Reference, Gaussians, Propagation]:
     """Complete one reference, carry it into every view, and make its Gaussians."""
     solid, tried = settings.masks.solid, {c.camera_id for c in run.references}
     choice: ReferenceChoice = run(
-        f"reference{suffix}", lambda: choose_reference(open_views, wanted, solid, settings.reference, tried)
+        f"reference{so_far.suffix}", lambda: choose_reference(so_far.views, wanted, solid, settings.reference, tried)
     )
     run.references.append(choice)
-    view = next(v for v in open_views if v.camera.id == choice.camera_id)
+    view = next(v for v in so_far.views if v.camera.id == choice.camera_id)
+    base, rough = so_far.painted[view.camera.id], _rough(so_far.charts, settings)
     completed: DepthCompletion = run(
-        f"depth{suffix}",
-        lambda: _complete_depth(view, open_views, hits, painted[view.camera.id], settings, given, first=not suffix),
+        f"depth{so_far.suffix}",
+        lambda: _complete_depth(view, so_far.views, so_far.hits, base, settings, given, first=not so_far.suffix),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
-    if _rough(charts, settings):
-        depth = snapped(depth, hits[view.camera.id].depth, max(c.scatter for c in charts)).astype(np.float32)
+    if rough:
+        scatter = max(c.scatter for c in so_far.charts)
+        depth = snapped(depth, so_far.hits[view.camera.id].depth, scatter).astype(np.float32)
     appearance: Appearance = run(
-        f"appearance{suffix}",
-        lambda: _appearance(view, depth, open_views, photos, painted[view.camera.id], settings, given),
+        f"appearance{so_far.suffix}",
+        lambda: _appearance(view, depth, so_far.views, so_far.photos, base, settings, given),
     )
     run.warnings += appearance.warnings
     name = view.camera.id
@@ -673,50 +642,34 @@ def _fill_from_one_view(
     ]
 
     def to_paint(v: ViewMasks, with_seeds: Gaussians) -> ViewToPaint:
-        if _rough(charts, settings):
-            return _on_charts(v, hits[v.camera.id], charts, photos, painted)
-        return _as_drawn(v, with_seeds, photos, painted, settings)
+        return _on_charts(v, so_far, so_far.charts) if rough else _as_drawn(v, so_far, with_seeds, settings)
 
     source = ~view.target & ~view.silhouette & (depth > 0)
     completed_reference, new, painting = _carried(
-        run,
-        suffix,
-        view.camera,
-        appearance,
-        depth,
-        view.target,
-        source,
-        filled,
-        open_views,
-        to_paint,
-        painted,
-        settings,
+        run, so_far, view.camera, appearance, depth, view.target, source, to_paint, settings
     )
     return completed_reference, new, _with_reference(painting, view, appearance)
 
 
 def _carried(
     run: _Run,
-    suffix: str,
+    so_far: _SoFar,
     camera: Camera,  # the reference
     appearance: Appearance,
     depth: np.ndarray,
     target: np.ndarray,
     source: np.ndarray,
-    filled: Gaussians,
-    open_views: Sequence[ViewMasks],
     to_paint: Callable[[ViewMasks, Gaussians], ViewToPaint],
-    painted: dict[str, np.ndarray],
     settings: RemovalSettings,
 ) -> tuple[Reference, Gaussians, Propagation]:
     """A completed reference in every view, and the Gaussians that show it."""
     at_chart = camera.split == CHART
-    seeds = seed_gaussians(camera, appearance.image, depth, target, filled.is_surfels, settings.seed, at_chart)
+    seeds = seed_gaussians(camera, appearance.image, depth, target, so_far.filled.is_surfels, settings.seed, at_chart)
     if len(seeds) == 0:
         raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
-    with_seeds = filled.extended(seeds)
+    with_seeds = so_far.filled.extended(seeds)
     field_: MappingField = run(
-        f"mapping{suffix}",
+        f"mapping{so_far.suffix}",
         lambda: mapping_field(
             appearance.image,
             target,
@@ -724,7 +677,7 @@ def _carried(
             source_visibility(
                 camera,
                 depth,
-                [(v.camera, v.depth_before, v.silhouette) for v in open_views],
+                [(v.camera, v.depth_before, v.silhouette) for v in so_far.views],
                 settings.mapping,
             ),
             settings.mapping,
@@ -735,9 +688,9 @@ def _carried(
     )
     reference = Reference(camera, appearance.image, depth, target, source, field_.rows, field_.cols)
     painting: Propagation = run(
-        f"propagate{suffix}",
+        f"propagate{so_far.suffix}",
         lambda: propagate(
-            reference, [partial(to_paint, v, with_seeds) for v in open_views], settings.propagate, run.progress
+            reference, [partial(to_paint, v, with_seeds) for v in so_far.views], settings.propagate, run.progress
         ),
     )
     name = camera.id
@@ -748,18 +701,18 @@ def _carried(
             Picture(
                 "rules",
                 f"Filled view {p.camera_id}",
-                p.pasted(painted[p.camera_id]),
-                (p.rule_map(*painted[p.camera_id].shape[:2]), p.pasted(painted[p.camera_id], p.raw)),
+                p.pasted(so_far.painted[p.camera_id]),
+                (p.rule_map(*so_far.painted[p.camera_id].shape[:2]), p.pasted(so_far.painted[p.camera_id], p.raw)),
             )
             for p in _spread(painting.views)
         ),
     ]
-    cameras = [v.camera for v in open_views]
+    cameras = [v.camera for v in so_far.views]
     new: Gaussians = run(
-        f"seed{suffix}",
+        f"seed{so_far.suffix}",
         lambda: settle_gaussians(
-            filled,
-            colour_gaussians(seeds, camera, cameras, painting.views, filled.sh_degree, settings.seed),
+            so_far.filled,
+            colour_gaussians(seeds, camera, cameras, painting.views, so_far.filled.sh_degree, settings.seed),
             camera,
             cameras,
             painting.views,
