@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -300,23 +301,27 @@ def _settled(plane: Plane, half: float, levels: Sequence[Textures], settings: Ch
         finest = level == len(levels) - 1
         x, y = _grid(half, POINTS // 2 ** (len(levels) - 1 - level))
 
-        def agreement(at: np.ndarray, x: np.ndarray = x, y: np.ndarray = y, textures: Textures = textures) -> float:
-            height = at[0] * half + at[1] * x + at[2] * y
-            return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
-
-        def best_of(starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
-            told = [agreement(s) for s in starts]
-            return [starts[k] for k in np.argsort(told)[::-1][:count]]
-
+        agreement = partial(_agreement_at, plane, half, x, y, textures)
         if level == 0:
-            starts = best_of(starts, TRIED)
+            starts = _best_of(agreement, starts, TRIED)
         if finest:
-            starts = [*starts, *best_of([np.array([o, 0.0, 0.0]) for o in sweep], 1)]
+            starts = [*starts, *_best_of(agreement, [np.array([o, 0.0, 0.0]) for o in sweep], 1)]
         least = settings.precise if finest else STEP / 4
         found = [_climbed(agreement, start, STEP, least) for start in starts]
         starts = [max(found, key=lambda f: f[0])[1]]
     offset, slope_x, slope_y = starts[0]
     return plane.tilted(offset * half, slope_x, slope_y)
+
+
+def _agreement_at(plane: Plane, half: float, x: np.ndarray, y: np.ndarray, textures: Textures, at: np.ndarray) -> float:
+    """Of photos on the plane moved and tilted by `at` [3]: offset over `half`, two slopes."""
+    height = at[0] * half + at[1] * x + at[2] * y
+    return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+
+
+def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+    told = [agreement(s) for s in starts]
+    return [starts[k] for k in np.argsort(told)[::-1][:count]]
 
 
 def _climbed(
