@@ -428,7 +428,11 @@ def _placed(
     texel = _pixel_size(place, plane.normal, views)
     if not math.isfinite(texel):
         return None
-    texel = max(texel, float(size.max()) / settings.largest)
+    return facing_camera(plane, place, size, max(texel, float(size.max()) / settings.largest))
+
+
+def facing_camera(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float) -> tuple[Camera, float]:
+    """The camera that faces a rectangle [2] of a plane round a place, with texels of one side, and the plane's z."""
     width, height = (int(n) for n in np.ceil(size / texel))
     away = 4 * float(np.linalg.norm(size))
     rotation = np.stack([plane.right, plane.down, -plane.normal])
@@ -514,11 +518,11 @@ def _surface(
 def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
     """What photos show at points [H, W, 3] of a surface."""
     said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
-    there = _there(said)
+    there = shown_there(said)
     hole = _unseen(said) & there
     image, spread = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
-    limit = _usual_spread(spread[there & (photos > 1) & ~hole])
+    limit = usual_spread(spread[there & (photos > 1) & ~hole])
     alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & (hiding > photos)
@@ -550,7 +554,7 @@ def _told_by_colours(
     return below, object_ & (s.photos > 0)
 
 
-def _usual_spread(spread: np.ndarray) -> float:
+def usual_spread(spread: np.ndarray) -> float:
     """By how much photos' textures may differ and still show the surface: else they show what stands on it.
 
     A quarter of what several photos show is taken for the surface itself.
@@ -615,7 +619,7 @@ def _unseen(said: np.ndarray) -> np.ndarray:
     return (seen == 0) & (hidden > behind)
 
 
-def _there(said: np.ndarray) -> np.ndarray:
+def shown_there(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so nearest."""
     seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
     through = (said == Says.THROUGH).sum(0)

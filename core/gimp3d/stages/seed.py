@@ -12,7 +12,7 @@ import numpy as np
 from ..camera import Camera
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
-from ..raster import PictureGradients, RasterSettings, contributions, pixel_region, touched_window
+from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
@@ -335,11 +335,21 @@ def _colour_change(
 
 
 def _colour_step(scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]) -> tuple[np.ndarray, np.ndarray]:
-    """W's column sums, and Wᵀ (painted − drawn) in units of c_0, [N, 3] each, where the view's own pixels painted."""
+    """See missing_colours: of what the view's own pixels painted."""
     camera, paint = look
     wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
-    drawn, way_back = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"})).trace(new)
-    picture = paint.pasted(np.zeros((*wanted.shape, 3), np.uint8))
+    region = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"}))
+    return missing_colours(region, new, wanted, paint.pasted(np.zeros((*wanted.shape, 3), np.uint8)))
+
+
+def missing_colours(
+    region: PixelRegion,  # of the rest of the scene
+    new: Gaussians,
+    wanted: np.ndarray,  # [H, W] bool
+    picture: np.ndarray,  # [H, W, 3] uint8, what the view should show there
+) -> tuple[np.ndarray, np.ndarray]:
+    """W's column sums, and Wᵀ (picture − drawn) in units of c_0, [N, 3] each: W blends the new Gaussians' colours."""
+    drawn, way_back = region.trace(new)
     missing = np.where(wanted[..., None], picture / 255.0 - drawn.rgb, 0.0)
     one = np.broadcast_to(wanted[..., None], missing.shape)
     weights, error = (way_back.backward(PictureGradients(rgb=g.astype(np.float32))).sh[:, 0] for g in (one, missing))

@@ -1,0 +1,180 @@
+"""Which lights explain the darkness of surfaces, given what each of them would leave in shadow.
+
+Illumination from shadows (Sato, Sato and Ikeuchi 2003), on surfaces whose own colours are not known: what is compared
+are differences between neighbours, coarse and fine, robustly, as edges of texture are no shadow's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sparse
+from scipy.optimize import minimize
+
+LEAST_NOISE = 0.01  # of log luminance
+CHROMA = 3.0  # times the usual difference of colour, from which an edge is hardly one of light
+DARKEST = 0.95  # share of light that shadows may take together
+ROUNDS = 6  # of reweighting
+STEPS = 60  # of L-BFGS
+TINTS, TINTLESS = (0.7, 1.3), 40.0  # by which channels' strengths may differ, and how far that is held at 1
+SPREAD = 3.0  # standard deviations of colour beyond which more does not tell more
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A lit surface, on a grid."""
+
+    shown: np.ndarray  # [H, W] bool, where it is known
+    colours: np.ndarray  # [H, W, 3] log of linear colour
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Differences of log luminance between neighbouring blocks of all surfaces, and how to weigh them.
+
+    T texels that are known, all surfaces one after the other; K differences; B things besides shadow that may explain
+    them: light that changes evenly over a surface, and what goes with its hue.
+    """
+
+    operator: sparse.csr_matrix  # [K, T] takes differences
+    observed: np.ndarray  # [K]
+    besides: np.ndarray  # [K, B]
+    noise: np.ndarray  # [K] what differences usually are
+    weight: np.ndarray  # [K]
+    hues: np.ndarray  # [K, 3] differences of a channel's log less that of luminance
+
+    @classmethod
+    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int]) -> Lit:
+        """`levels` are sides of blocks, in texels."""
+        operators, besides, groups = [], [], []
+        for number, surface in enumerate(surfaces):
+            operator, group = _differences(surface.shown, levels)
+            operators.append(operator)
+            groups.append(group + 1000 * number)
+            besides.append(_besides(surface))
+        operator = sparse.block_diag(operators).tocsr()
+        group = np.concatenate(groups)
+        colours = np.concatenate([s.colours[s.shown] for s in surfaces])
+        luminance = np.log(np.exp(colours).mean(1))
+        observed = operator @ luminance
+        hues = operator @ colours - observed[:, None]
+        other = operator @ scipy.linalg.block_diag(*besides)
+        noise = _usual(observed - other @ _explained(observed, other, group), group)
+        colourful = np.abs(hues).max(1)
+        weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
+        return cls(operator, observed, other, noise, weight, hues)
+
+    def fit(self, shadows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Strengths ≥ 0 of shadows [T, S], coefficients of what is besides [B], and the loss that is left.
+
+        Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
+        """
+        count = shadows.shape[1]
+        shadows = shadows.astype(np.float64)
+
+        def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+            taken = shadows @ x[:count]
+            left = 1 - np.minimum(taken, DARKEST)
+            u = (self.observed - self.operator @ np.log(left) - self.besides @ x[count:]) / self.noise
+            root = np.sqrt(1 + u * u)
+            slope = self.weight * u / root / self.noise
+            at = (self.operator.T @ slope) / left * (taken < DARKEST)
+            return float((self.weight * (root - 1)).sum()), np.concatenate([shadows.T @ at, -self.besides.T @ slope])
+
+        bounds = [(0, 1)] * count + [(None, None)] * self.besides.shape[1]
+        found = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+        return found.x[:count], found.x[count:], float(found.fun)
+
+    def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+        """[S, 3] by what strengths [S] of shadows [T, S] differ between the channels: their mean is about 1."""
+        dark = np.minimum(shadows @ strengths, DARKEST)
+        grey = self.operator @ np.log(1 - dark)
+        noise = self.hues.std(0) + LEAST_NOISE
+        scaled = shadows.astype(np.float64) * strengths
+
+        def loss(x: np.ndarray, channel: int) -> tuple[float, np.ndarray]:
+            left = 1 - np.minimum(scaled @ x, DARKEST)
+            u = (self.hues[:, channel] + grey - self.operator @ np.log(left)) / noise[channel]
+            root = np.sqrt(1 + u * u)
+            slope = scaled.T @ ((self.operator.T @ (u / root / noise[channel])) / left)
+            held = TINTLESS * (x - 1)
+            return float((root - 1).sum() + 0.5 * held @ (x - 1)), slope + held
+
+        start, bounds = np.ones(len(strengths)), [TINTS] * len(strengths)
+        found = [minimize(loss, start, (c,), jac=True, method="L-BFGS-B", bounds=bounds).x for c in range(3)]
+        return np.stack(found, 1)
+
+    def residual(self, darkness: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """[K] what is left of the differences; `darkness` [T] is the share of light that shadows take."""
+        lit = np.log(1 - np.minimum(darkness, DARKEST))
+        return self.observed - self.operator @ lit - self.besides @ coefficients
+
+    def only(self, rows: np.ndarray) -> Lit:
+        """With only these differences [K] bool counted."""
+        return replace(self, weight=self.weight * rows)
+
+    def changes(self, shadows: np.ndarray) -> np.ndarray:
+        """[K, S] float32: how differences change, about, with the strength of shadows [T, S]."""
+        return self.operator.astype(np.float32) @ shadows.astype(np.float32, copy=False)
+
+    def gains(self, changes: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """[S]: by how much each of more shadows, see changes, would lower the loss at its best strength, about."""
+        root = np.sqrt(1 + (residual / self.noise) ** 2)
+        curve = self.weight / root / self.noise**2
+        down = -((curve * residual).astype(np.float32) @ changes).astype(np.float64)
+        bend = np.einsum("ks,ks,k->s", changes, changes, curve.astype(np.float32)) + 1e-9
+        strength = np.clip(down / bend, 0, 1)
+        return strength * down - 0.5 * strength**2 * bend
+
+
+def _differences(shown: np.ndarray, levels: Sequence[int]) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """The operator on known texels, and which differences are of a kind: of one side of blocks and one direction."""
+    h, w = shown.shape
+    index = np.cumsum(shown.ravel()).reshape(h, w) - 1
+    count = int(shown.sum())
+    parts, kinds = [], []
+    for level, side in enumerate(levels):
+        high, wide = h // side, w // side
+        rows, cols = np.nonzero(shown[: high * side, : wide * side])
+        block = (rows // side) * wide + cols // side
+        members = np.bincount(block, minlength=high * wide)
+        mean = sparse.csr_matrix((1 / members[block], (block, index[rows, cols])), (high * wide, count))
+        known = (2 * members >= side * side).reshape(high, wide)
+        for direction, (pair, step) in enumerate(((known[:, 1:] & known[:, :-1], 1), (known[1:] & known[:-1], wide))):
+            first = np.flatnonzero(np.pad(pair, ((0, high - pair.shape[0]), (0, wide - pair.shape[1]))).ravel())
+            parts.append(mean[first + step] - mean[first])
+            kinds.append(np.full(len(first), 2 * level + direction))
+    return sparse.vstack(parts).tocsr(), np.concatenate(kinds)
+
+
+def _besides(surface: Surface) -> np.ndarray:
+    """[T, 10]: quadratic in place, and in hue (which light keeps, so that what goes with it is the surface's own)."""
+    y, x = (2 * i[surface.shown] / max(surface.shown.shape) - 1 for i in np.indices(surface.shown.shape))
+    colours = surface.colours[surface.shown]
+    hues = colours[:, [0, 2]] - colours[:, 1:2]
+    spread = hues.std(0) + 1e-3
+    a, b = np.clip((hues - np.median(hues, axis=0)) / spread, -SPREAD, SPREAD).T
+    return np.stack([x, y, x * x, x * y, y * y, a, b, a * a, a * b, b * b], axis=1)
+
+
+def _usual(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """[K]: the robust standard deviation of a value's group."""
+    out = np.empty(len(values))
+    for kind in np.unique(group):
+        on = group == kind
+        out[on] = max(1.4826 * float(np.median(np.abs(values[on]))), LEAST_NOISE)
+    return out
+
+
+def _explained(observed: np.ndarray, other: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """[B] robust least squares, each group by its own noise."""
+    noise, found = np.full(len(observed), max(float(np.std(observed)), LEAST_NOISE)), np.zeros(other.shape[1])
+    for _ in range(ROUNDS):
+        weight = 1 / np.sqrt(1 + ((observed - other @ found) / noise) ** 2) / noise**2
+        scaled = other * weight[:, None]
+        found = np.linalg.solve(scaled.T @ other + 1e-6 * np.eye(other.shape[1]), scaled.T @ observed)
+        noise = _usual(observed - other @ found, group)
+    return found

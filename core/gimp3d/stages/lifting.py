@@ -1,0 +1,209 @@
+"""Undoing a shadow: photos and Gaussians as they would look with the light that the object kept from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..gaussians import SH_C0, Gaussians
+from ..raster import label_weights, pixel_region
+from ..threads import parallel_map
+from .seed import missing_colours
+from .shadow import Ground, Shadow, linear
+from .witness import Witness
+
+STRIDE = 4  # px between those that are asked first
+EVEN = 0.02  # share of light up to which their neighbours are as they are
+UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
+DARKEST = 0.15  # share of light below which a photo holds too little texture to be lifted: it is filled
+PATCH = 9  # px in which a photo and the ground are compared
+ALIKE = 20.0  # grey levels by which they may differ
+SAME = 0.05  # relative z up to which what is drawn nearer than an unknown ground is still that ground
+BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
+LOOKS = 12  # views by which colours are corrected
+CORRECTIONS = 3  # steps
+HOLD = 3.0  # px of blend weight by which colours are held
+SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """A scene and its photos without the object's shadow."""
+
+    photos: tuple[np.ndarray, ...]  # [H, W, 3] uint8, of the witnesses
+    shaded: tuple[np.ndarray, ...]  # [H, W] bool, what changed in them
+    dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted
+    rows: np.ndarray  # [M] of the scene whose colours changed
+    sh: np.ndarray  # [M, K, 3] their new ones
+    confidence: float
+    reason: str
+
+    def scene(self, scene: Gaussians) -> Gaussians:
+        """The scene with the new colours."""
+        sh = scene.sh.copy()
+        sh[self.rows] = self.sh
+        return replace(scene, sh=sh)
+
+
+def lift_shadow(
+    scene: Gaussians,
+    removed: np.ndarray,  # [N] bool, the object
+    shadow: Shadow,
+    witnesses: Sequence[Witness],
+) -> Lifted:
+    """Divide linear light by the share of it that arrives, in photos and in the Gaussians that they show in shadow."""
+    arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
+
+    def lifted(witness: Witness, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        shaded = (light.min(-1) < UNTOUCHED) & ~witness.hidden
+        dark = shaded & (light.mean(-1) < DARKEST)
+        bright = encoded(linear(witness.photo[shaded]) / np.maximum(light[shaded], DARKEST))
+        photo = witness.photo.copy()
+        photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
+        return photo, shaded, dark
+
+    photos, shaded, dark = zip(*(lifted(w, a) for w, a in zip(witnesses, arriving)))
+    rows, sh = _brighter(scene, removed, witnesses, arriving)
+    sh = _matched(scene, removed, rows, sh, witnesses, photos, shaded)
+    share = np.mean([s.mean() for s in shaded])
+    words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
+    return Lifted(photos, shaded, dark, rows, sh, shadow.confidence, words)
+
+
+def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
+    """[H, W, 3] the share of light that arrives at what a view shows; 1 where it shows nothing.
+
+    Where the photo looks as the others show the ground there, it is the ground, whatever the drawn depth: splats'
+    depths are rough. What is drawn before it, and looks otherwise, stands on it.
+    """
+    camera, depth = witness.camera, witness.depth
+    rays = camera.unproject(camera.pixel_centres(), np.ones(depth.shape)) - camera.centre
+    z, on = depth.astype(np.float64), np.full(depth.shape, -1)
+    for number, ground in enumerate(shadow.grounds):
+        there, is_it = _shows(witness, ground, rays)
+        nearer = is_it & ((on < 0) | (there < z))
+        z, on = np.where(nearer, there, z), np.where(nearer, number, on)
+    points = camera.centre + z[..., None] * rays
+    out = np.ones((*depth.shape, 3), np.float32)
+
+    def ask(rows: np.ndarray, cols: np.ndarray) -> None:
+        for number in np.unique(on[rows, cols]):
+            of = (on[rows, cols] == number) & (depth[rows, cols] > 0)
+            r, c = rows[of], cols[of]
+            out[r, c] = shadow.arriving(points[r, c], shadow.grounds[number].plane.normal if number >= 0 else None)
+
+    h, w = depth.shape
+    some_rows, some_cols = np.unique([*range(0, h, STRIDE), h - 1]), np.unique([*range(0, w, STRIDE), w - 1])
+    grid = np.ix_(some_rows, some_cols)
+    ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
+    few = out[grid]
+    if few.min() > UNTOUCHED:
+        return out
+    kernel = np.ones((3, 3), np.uint8)
+    dim = few.mean(-1)
+    uneven = cv2.dilate(dim, kernel) - cv2.erode(dim, kernel) > EVEN
+    number = on[grid].astype(np.float32)
+    uneven |= (cv2.dilate(number, kernel) != cv2.erode(number, kernel)) & (cv2.erode(dim, kernel) < UNTOUCHED)
+    y, x = (np.interp(np.arange(n), some, np.arange(len(some))).astype(np.float32) for n, some in ((h, some_rows), (w, some_cols)))
+    x, y = np.meshgrid(x, y)
+    out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
+    return out
+
+
+def _shows(witness: Witness, ground: Ground, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] each: z where rays meet a ground, and whether it is what the photo shows there."""
+    camera, plane = witness.camera, ground.plane
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = ((plane.origin - camera.centre) @ plane.normal) / (rays @ plane.normal)
+    z = np.where(np.isfinite(z) & (z > 0), z, 0.0)
+    uv, _ = ground.camera.project(camera.centre + z[..., None] * rays)
+    x, y = (np.nan_to_num(uv, nan=-9.0).astype(np.float32) - 0.5).transpose(2, 0, 1)
+    known = cv2.remap(ground.known.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
+    expected = cv2.remap(ground.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
+    weight = known.astype(np.float32)
+    off = np.abs(expected - witness.photo).max(-1) * weight
+    off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)
+    same = witness.depth > (1 - SAME) * z
+    return z, (z > 0) & np.where(known, off < ALIKE, same)
+
+
+def _brighter(
+    scene: Gaussians, removed: np.ndarray, witnesses: Sequence[Witness], arriving: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [M] and new colours [M, K, 3] of the Gaussians that photos show in the shadow.
+
+    Each by the mean of the light that arrives in the pixels that show it, by its blend weights: where it is drawn
+    tells more than where its mean lies.
+    """
+    stays = np.flatnonzero(~removed)
+    kept = scene.take(stays)
+
+    def of(pair: tuple[Witness, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+        witness, light = pair
+        logs = np.log(np.maximum(light, DARKEST))
+        dim = -logs.mean(-1) / -np.log(DARKEST)
+        if not (dim > 0).any():
+            return None
+        labels = np.where(witness.hidden, 0, 1 + np.minimum(np.ceil(dim * BINS), BINS)).astype(np.uint8)
+        count = np.bincount(labels.ravel(), minlength=BINS + 2)
+        level = np.stack([np.bincount(labels.ravel(), logs[..., k].ravel(), BINS + 2) for k in range(3)], 1)
+        level = (level / np.maximum(count, 1)[:, None])[1:]
+        weights = label_weights(kept, witness.camera, labels, BINS + 1)
+        return weights.sum(0), weights.T @ level.astype(np.float32)
+
+    total, dimmed = np.zeros(len(kept)), np.zeros((len(kept), 3))
+    pairs = list(zip(witnesses, arriving))
+    for start in range(0, len(pairs), 8):  # few results at a time are in memory
+        for part in parallel_map(of, pairs[start : start + 8]):
+            if part is not None:
+                total += part[0]
+                dimmed += part[1]
+    light = np.exp(dimmed / np.maximum(total, 1e-9)[:, None])
+    rows = np.flatnonzero((total > SHOWN) & (light.min(1) < UNTOUCHED))
+    sh = kept.sh[rows].astype(np.float64)
+    colour = np.clip(0.5 + SH_C0 * sh[:, 0], 0.02, 1.0)
+    gain = encoded(_decoded(colour) / light[rows]) / colour
+    sh[:, 0] = (gain * (0.5 + SH_C0 * sh[:, 0]) - 0.5) / SH_C0
+    sh[:, 1:] *= gain[:, None]
+    return stays[rows], sh.astype(np.float32)
+
+
+def _matched(
+    scene: Gaussians,
+    removed: np.ndarray,
+    rows: np.ndarray,
+    sh: np.ndarray,  # [M, K, 3] of these rows
+    witnesses: Sequence[Witness],
+    photos: Sequence[np.ndarray],
+    shaded: Sequence[np.ndarray],
+) -> np.ndarray:
+    """The colours corrected so that the scene, drawn, shows the lifted photos: least squares (SIRT), c_0 alone."""
+    if not len(rows):
+        return sh
+    others = ~removed
+    others[rows] = False
+    rest, lit = scene.take(others), replace(scene.take(rows), sh=sh)
+    most = sorted(range(len(witnesses)), key=lambda k: -int(shaded[k].sum()))[:LOOKS]
+    wanted = [shaded[k] & ~witnesses[k].beside for k in most]
+    looks = [(k, w) for k, w in zip(most, wanted) if w.any()]
+    regions = parallel_map(lambda l: pixel_region(rest, witnesses[l[0]].camera, l[1], passes=frozenset({"rgb"})), looks)
+    for _ in range(CORRECTIONS):
+        steps = parallel_map(lambda p: missing_colours(p[0], lit, p[1][1], photos[p[1][0]]), zip(regions, looks))
+        change = sum(s[1] for s in steps) / (sum(s[0] for s in steps) + HOLD)
+        corrected = lit.sh.copy()
+        corrected[:, 0] += change
+        lit = replace(lit, sh=corrected)
+    return lit.sh
+
+
+def encoded(light: np.ndarray) -> np.ndarray:
+    """sRGB of linear light (IEC 61966-2-1)."""
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _decoded(colour: np.ndarray) -> np.ndarray:
+    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)

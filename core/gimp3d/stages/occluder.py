@@ -1,0 +1,108 @@
+"""The object as a small volume that blocks light: its Gaussians, spread over cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import norm, qmc
+
+from ..gaussians import Gaussians, quats_to_matrices
+from ..jit import kernel
+from ..threads import run_ranges
+from .charts import Plane
+
+CELLS = 40  # along the longest side
+SAMPLES = 16  # of every Gaussian, by which it is spread over cells
+FAINT = 0.05  # opacity below which a Gaussian blocks nothing worth telling
+LARGE = 0.25  # of the region's diagonal, from which a Gaussian is no part of an object that size
+LOW = 0.03  # of the diagonal: what is lower is the surface that went along
+STEP = 0.8  # cells that a ray goes at once
+
+
+@dataclass(frozen=True)
+class Occluder:
+    """What blocks light, in the axes of a plane: x and y along it, z its height."""
+
+    plane: Plane
+    low: np.ndarray  # [3] corner of the volume
+    cell: float  # side of a cell
+    thickness: np.ndarray  # [X, Y, Z] float32: optical depth of a way of one cell's length
+
+    @classmethod
+    def make(cls, gaussians: Gaussians, plane: Plane, diagonal: float) -> Occluder | None:
+        """Of the Gaussians that stand above the plane; None if none does.
+
+        A Gaussian blocks as much as an opaque disk of area 2π σ₁ σ₂ · opacity, whichever way it lies.
+        """
+        scales = -np.sort(-gaussians.scales, axis=1).astype(np.float64)
+        means = plane.local(gaussians.means.astype(np.float64))
+        blocks = gaussians.usable & (gaussians.opacity > FAINT) & (scales[:, 0] < LARGE * diagonal)
+        blocks &= means[:, 2] > LOW * diagonal
+        if blocks.sum() < SAMPLES:
+            return None
+        g, means, scales = gaussians.take(blocks), means[blocks], scales[blocks]
+        frame = np.stack([plane.right, plane.down, plane.normal])
+        own = g.scales.astype(np.float64)
+        own = np.concatenate([own, np.zeros((len(g), 3 - own.shape[1]))], axis=1)
+        axes = frame @ quats_to_matrices(g.quats.astype(np.float64)) * own[:, None]
+        normal = norm.ppf((qmc.Sobol(3, scramble=False).random(SAMPLES) + 0.5 / SAMPLES) % 1)
+        points = means[:, None] + np.einsum("nij,sj->nsi", axes, normal)
+        low, high = np.percentile(means, 0.5, axis=0), np.percentile(means, 99.5, axis=0)
+        low[2] = max(low[2], 0.0)
+        low, high = low - 0.02 * diagonal, high + 0.02 * diagonal
+        cell = float((high - low).max()) / CELLS
+        shape = np.maximum(1, np.ceil((high - low) / cell)).astype(int)
+        index = np.floor((points - low) / cell).astype(int)
+        inside = ((index >= 0) & (index < shape)).all(-1)
+        area = 2 * np.pi * scales[:, 0] * scales[:, 1] * g.opacity / SAMPLES
+        weights = np.broadcast_to(area[:, None], inside.shape)[inside]
+        cells = np.bincount(np.ravel_multi_index(tuple(index[inside].T), tuple(shape)), weights, int(shape.prod()))
+        return cls(plane, low, cell, (cells / cell**2).reshape(shape).astype(np.float32))
+
+    @cached_property
+    def size(self) -> np.ndarray:
+        """[3] sides of the volume."""
+        return np.array(self.thickness.shape) * self.cell
+
+    def moved(self, x: float, y: float) -> Occluder:
+        """The same object elsewhere on the plane."""
+        return replace(self, low=self.low + [x, y, 0.0])
+
+    def blocked(
+        self,
+        points: np.ndarray,  # [N, 3] scene coordinates
+        directions: np.ndarray,  # [D, 3] unit, in the plane's axes, towards the light
+    ) -> np.ndarray:
+        """[N, D] float32: the share of light from far away that does not arrive (Beer and Lambert)."""
+        out = np.zeros((len(points), len(directions)), np.float32)
+        start = (self.plane.local(points) - self.low) / self.cell
+        run_ranges(_march_range, len(points), start, np.ascontiguousarray(directions), self.thickness, STEP, out)
+        return out
+
+
+@kernel
+def _march_range(lo, hi, points, directions, thickness, step, out):
+    nx, ny, nz = thickness.shape
+    for i in range(lo, hi):
+        for k in range(len(directions)):
+            enter, leave = 0.5, 1e9  # a cell's own matter is no shadow on it
+            for axis in range(3):
+                p, d, n = points[i, axis], directions[k, axis], thickness.shape[axis]
+                if abs(d) < 1e-9:
+                    if p < 0 or p >= n:
+                        leave = -1.0
+                else:
+                    a, b = -p / d, (n - p) / d
+                    enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
+            depth = 0.0
+            t = enter + 0.5 * step
+            while t < leave and depth * step < 10:
+                x = int(points[i, 0] + t * directions[k, 0])
+                y = int(points[i, 1] + t * directions[k, 1])
+                z = int(points[i, 2] + t * directions[k, 2])
+                if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                    depth += thickness[x, y, z]
+                t += step
+            out[i, k] = 1 - np.exp(-depth * step)

@@ -1,0 +1,372 @@
+"""The object's shadow: the light that it keeps from surfaces, found by casting its own Gaussians from every direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.stats import norm
+
+from ..box import Region
+from ..camera import Camera
+from ..gaussians import Gaussians
+from ..solvers.lights import Lit, Surface
+from ..threads import parallel_map
+from .charts import PARALLEL, Plane, extent, facing_camera, shown_there, usual_spread
+from .mosaic import mosaic
+from .occluder import Occluder
+from .witness import Says, Witness, ask
+
+REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
+DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
+LEVELS = (2, 4, 8, 16)  # texels: sides of blocks whose luminance is compared …
+BROAD = (8, 16)  # … to tell how strong lights are: finer ones see edges, which no cast meets exactly
+DIRECTIONS = 384  # about 8° apart
+LOWEST = 8.0  # degrees above the support: light that comes from lower down is no light's
+SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried …
+ROUND = (384, 160, 32)  # … and how many of each
+SAMPLES = 48  # rays to a light
+SKY = 96  # and to the sky
+MOST = 3  # lights
+COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled
+ELSEWHERE = 8  # places of the object that it might as well have …
+ASIDE = 1.1  # … so many of its widths away
+EARNS = 1.2  # times what chance explains, that a light must explain
+TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
+DARK = 2e-3  # of linear light, noise of a photo's
+FEWEST = 50  # texels of a surface that is looked at
+BESIDE = 2  # texels beside what the object hides that may show some of it
+VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
+
+
+@dataclass(frozen=True)
+class Light:
+    """A lobe of light from far away, or the whole sky's."""
+
+    towards: np.ndarray  # [3] unit, in the axes of the support: right, down, normal
+    softness: float  # degrees, σ; infinite: the sky, evenly
+    strength: np.ndarray  # [3] share of a surface's light that comes from it, per channel
+
+    @property
+    def elevation(self) -> float:
+        """Degrees above the support."""
+        return math.degrees(math.asin(float(np.clip(self.towards[2], -1, 1))))
+
+    def rays(self, count: int = SAMPLES) -> np.ndarray:
+        """[count, 3] directions, evenly drawn from the lobe (a sunflower's seeds)."""
+        if not math.isfinite(self.softness):
+            return _hemisphere(SKY)
+        k = np.arange(count)
+        radius = math.radians(self.softness) * np.sqrt(-2 * np.log(1 - (k + 0.5) / count))
+        angle = k * math.pi * (3 - math.sqrt(5))
+        a, b = _across(self.towards)
+        rays = self.towards + np.tan(np.minimum(radius, 1.3))[:, None] * (
+            np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b
+        )
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What photos show of a plane round the object, coarsely; arrays [H, W] of a camera that faces it."""
+
+    plane: Plane
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] uint8
+    known: np.ndarray  # bool, several photos show it, and much the same
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """What the object keeps from its surroundings."""
+
+    lights: tuple[Light, ...]
+    occluder: Occluder
+    grounds: tuple[Ground, ...]  # what it may fall on
+    explained: float  # share of what tells the shadow from the surface's texture
+    confidence: float  # 1 less what chance explains over what the lights do
+    reason: str
+
+    def arriving(
+        self,
+        points: np.ndarray,  # [N, 3] scene coordinates
+        normal: np.ndarray | None = None,  # [3] unit, of the surface they are on; None: lit from everywhere
+    ) -> np.ndarray:
+        """[N, 3] the share of light, per channel, that the object lets through; 1 far from it."""
+        taken = np.zeros((len(points), 3))
+        for light in self.lights:
+            taken += _cast(self.occluder, points, normal, light)[:, None] * light.strength
+        return 1 - np.minimum(taken, 1 - DARK)
+
+
+@dataclass(frozen=True)
+class _Receiver:
+    """A surface that a shadow may fall on, to be told from its colours."""
+
+    surface: Surface
+    points: np.ndarray  # [T, 3] of its known texels
+    normal: np.ndarray  # [3]
+
+    @classmethod
+    def make(cls, ground: Ground) -> _Receiver:
+        camera = ground.camera
+        z = float(camera.project(ground.plane.origin[None])[1][0])
+        points = camera.unproject(camera.pixel_centres(), np.full(ground.known.shape, z))
+        return cls(Surface(ground.known, np.log(linear(ground.image) + DARK)), points[ground.known], ground.plane.normal)
+
+    def halved(self) -> _Receiver:
+        """Blocks of four texels, where half of them are known."""
+        h, w = (2 * (n // 2) for n in self.surface.shown.shape)
+        shown = self.surface.shown[:h, :w]
+        points = np.zeros((*self.surface.shown.shape, 3))
+        points[self.surface.shown] = self.points
+
+        def blocks(values: np.ndarray) -> np.ndarray:
+            return values[:h, :w].reshape(h // 2, 2, w // 2, 2, -1).sum((1, 3))
+
+        count = blocks(shown)
+        known = count[..., 0] >= 2
+        colours, points = (blocks(np.where(shown[..., None], v[:h, :w], 0)) / np.maximum(count, 1) for v in (self.surface.colours, points))
+        return replace(self, surface=Surface(known, colours), points=points[known])
+
+
+def find_shadow(
+    gone: Gaussians,  # the object
+    planes: Sequence[Plane],  # of the surfaces round it, the support first
+    witnesses: Sequence[Witness],
+    region: Region,
+    tolerance: float,  # relative z within which a view shows a surface
+) -> Shadow | str:
+    """The lights whose shadows of the object explain what is dark round it; or why there is none.
+
+    Candidates are lobes of light all over the sky. The one that explains most of the differences of luminance round
+    the object is taken, then the next. Texture is explained a little by any shadow: a light must explain clearly more
+    than the best one does for the same object elsewhere on the support, or for brightness in darkness' place.
+    """
+    if not planes:
+        return "no shadow found: no surface is known that it could fall on"
+    occluder = Occluder.make(gone, planes[0], extent(region))
+    if occluder is None:
+        return "no shadow found: nothing stands on the surface"
+    grounds = look_at(planes, witnesses, region, tolerance)
+    fine = [_Receiver.make(g) for g in grounds]
+    receivers = [half for half in (r.halved() for r in fine) if half.surface.shown.sum() >= FEWEST]
+    if not receivers:
+        return "no shadow found: photos do not show the surface round the object"
+    lit = Lit.make([r.surface for r in receivers], LEVELS)
+    sky = _Sky.make()
+    shadows = sky.cast(occluder, receivers)
+    step = ASIDE * float(max(occluder.size[:2]))
+    around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
+    moved = [sky.cast(occluder.moved(step * math.cos(a), step * math.sin(a)), receivers) for a in around]
+    found, ratio = _earning(lit, shadows, moved)
+    if not found:
+        return f"no shadow found: the best light explains {ratio:.1f} times what chance does"
+    lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
+    return _settled(lights, occluder, grounds, fine, ratio)
+
+
+@dataclass(frozen=True)
+class _Sky:
+    """Candidates for lights: lobes of several widths, in the support's axes."""
+
+    rays: np.ndarray  # [D, 3]
+    lobes: np.ndarray  # [D, A] float32, what share of a lobe each ray is
+    towards: np.ndarray  # [A, 3]
+    softness: np.ndarray  # [A] degrees
+
+    @classmethod
+    def make(cls) -> _Sky:
+        rays = _hemisphere(DIRECTIONS)
+        lobes, towards, softness = [], [], []
+        for width, count in zip(SOFTNESS, ROUND):
+            middle = _hemisphere(count)
+            apart = np.degrees(np.arccos(np.clip(rays @ middle.T, -1, 1)))
+            lobe = np.exp(-0.5 * (apart / width) ** 2)
+            lobes.append(lobe / lobe.sum(0))
+            towards.append(middle)
+            softness.append(np.full(count, width))
+        return cls(rays, np.concatenate(lobes, 1).astype(np.float32), np.concatenate(towards), np.concatenate(softness))
+
+    def cast(self, occluder: Occluder, receivers: Sequence[_Receiver]) -> np.ndarray:
+        """[T, A] float32: the share of each lobe that the object keeps from every texel."""
+        return np.concatenate(
+            [
+                (occluder.blocked(r.points, self.rays) * _faces(occluder.plane, r.normal, self.rays)) @ self.lobes
+                for r in receivers
+            ]
+        )
+
+
+def _earning(lit: Lit, shadows: np.ndarray, moved: Sequence[np.ndarray]) -> tuple[list[int], float]:
+    """Which candidates are lights, and how many times what chance explains the weakest of them does.
+
+    Chance is the larger of two: what brightness of the same shapes, here or elsewhere, explains of all that is left,
+    and what the object elsewhere explains of that which the light does: a stain is explained from anywhere.
+    """
+    own, elsewhere = lit.changes(shadows), [lit.changes(m) for m in moved]
+    found: list[int] = []
+    for _ in range(MOST):
+        found.append(int(lit.gains(own, _left(lit, shadows, found)[0]).argmax()))
+    ratio = 0.0
+    while found:
+        left, strength = _left(lit, shadows, found)
+        bright = max(float(lit.gains(changes, -left).max()) for changes in (own, *elsewhere))
+        ratios = []
+        for k, s in zip(found, strength):
+            without, _ = _left(lit, shadows, [o for o in found if o != k])
+            there = lit.only(np.abs(own[:, k]) * s > TOLD * lit.noise)
+            explained = float(there.gains(own[:, [k]], without)[0])
+            rivals = max(float(there.gains(changes, without).max()) for changes in elsewhere)
+            gain = float(lit.gains(own[:, [k]], without)[0])
+            ratios.append(min(gain / max(bright, 1e-12), explained / max(rivals, 1e-12)))
+        ratio = min(ratios)
+        if ratio >= EARNS:
+            break
+        found.pop(int(np.argmin(ratios)))
+    return found, ratio
+
+
+def _left(lit: Lit, shadows: np.ndarray, found: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The differences that these candidates do not explain [K], and their strengths."""
+    strength, besides, _ = lit.fit(shadows[:, found])
+    return lit.residual(shadows[:, found] @ strength, besides), strength
+
+
+def _settled(
+    lights: list[Light], occluder: Occluder, grounds: Sequence[Ground], receivers: Sequence[_Receiver], ratio: float
+) -> Shadow:
+    """Directions, softness, strength and tint, precisely: a pattern search on finer charts."""
+    lit = Lit.make([r.surface for r in receivers], LEVELS)
+
+    def cast(light: Light) -> np.ndarray:
+        return np.concatenate([_cast(occluder, r.points, r.normal, light) for r in receivers])
+
+    count = len(lights)
+    lights = [*lights, Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))]
+    shadows = np.stack([cast(light) for light in lights], 1)
+    step = COARSEST
+    while step >= FINEST:
+        moved = False
+        strength, besides, _ = lit.fit(shadows)
+        for k in range(count):
+            others = np.delete(shadows, k, axis=1) @ np.delete(strength, k)
+            tries = [lights[k], *_near(lights[k], step)]
+            casts = np.stack([cast(t) for t in tries], 1).astype(np.float32)
+            best = int(lit.gains(lit.changes(casts), lit.residual(others, besides)).argmax())
+            moved |= best > 0
+            lights[k], shadows[:, k] = tries[best], casts[:, best]
+        if not moved:
+            step /= 2
+    nothing, loss = (lit.fit(shadows[:, :n])[2] for n in (0, count + 1))
+    broad = Lit.make([r.surface for r in receivers], BROAD)
+    strength = broad.fit(shadows)[0]
+    tints = broad.tints(shadows, strength)
+    lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
+    words = ", ".join(
+        f"{light.strength.mean():.0%} from {light.elevation:.0f}° above it, soft by {light.softness:.0f}°"
+        for light in lights[:count]
+    )
+    words += f", {lights[count].strength.mean():.0%} from the sky"
+    return Shadow(tuple(lights), occluder, tuple(grounds), 1 - loss / nothing, 1 - 1 / ratio, words)
+
+
+def _near(light: Light, step: float) -> list[Light]:
+    """Lights a step aside, softer and harder."""
+    a, b = _across(light.towards)
+    found = []
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        towards = light.towards + math.tan(math.radians(step)) * (x * a + y * b)
+        towards /= np.linalg.norm(towards)
+        if towards[2] > math.sin(math.radians(LOWEST)):
+            found.append(replace(light, towards=towards))
+    factor = 1 + step / 8
+    return [*found, *(replace(light, softness=float(np.clip(light.softness * f, 0.5, 45.0))) for f in (factor, 1 / factor))]
+
+
+def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, light: Light) -> np.ndarray:
+    """[N] the share of a light that does not arrive."""
+    rays = light.rays()
+    rays = rays[rays[:, 2] > 0]
+    blocked = occluder.blocked(points, rays)
+    facing = np.ones(len(rays)) if normal is None else _faces(occluder.plane, normal, rays)
+    if not math.isfinite(light.softness):
+        up = rays[:, 2] if normal is None else rays @ _turned(occluder.plane, normal)
+        facing = facing * np.maximum(up, 0) / max(float(np.maximum(up, 0).mean()), 1e-6)
+    return blocked @ (facing / len(rays)).astype(np.float32)
+
+
+def _faces(plane: Plane, normal: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """[D]: a wall gets no light from behind."""
+    return (rays @ _turned(plane, normal) > 0.02).astype(np.float32)
+
+
+def _turned(plane: Plane, direction: np.ndarray) -> np.ndarray:
+    """[3] in the plane's axes."""
+    return np.stack([plane.right, plane.down, plane.normal]) @ direction
+
+
+def _across(towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across a direction."""
+    aside = np.eye(3)[int(np.argmin(np.abs(towards)))]
+    a = np.cross(towards, aside)
+    a /= np.linalg.norm(a)
+    return a, np.cross(towards, a)
+
+
+def _hemisphere(count: int) -> np.ndarray:
+    """[count, 3] directions, evenly spread (Fibonacci's spiral), from LOWEST up."""
+    k = np.arange(count)
+    low = math.sin(math.radians(LOWEST))
+    z = low + (1 - low) * (k + 0.5) / count
+    r, angle = np.sqrt(1 - z * z), k * math.pi * (3 - math.sqrt(5))
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)
+
+
+def look_at(
+    planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, tolerance: float
+) -> list[Ground]:
+    """What photos show of the planes round the object, where they show enough."""
+    diagonal = extent(region)
+    found = []
+    for plane in planes:
+        side = 2 * REACH * diagonal
+        camera, away = facing_camera(plane, plane.origin, np.full(2, side), diagonal / DENSITY)
+        points = camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), away))
+        softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
+        said = ask(softened, points.reshape(-1, 3), tolerance).reshape(-1, camera.height, camera.width)
+        image, spread = mosaic(points, plane.normal, softened, said)
+        photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
+        known = shown_there(said) & (photos > 1)
+        known &= spread < VIEWED * usual_spread(spread[known])
+        hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
+        known &= cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) == 0
+        for other in planes:
+            if abs(other.normal @ plane.normal) <= PARALLEL:
+                known &= other.local(points.reshape(-1, 3))[:, 2].reshape(known.shape) > 0
+        if known.sum() >= FEWEST:
+            found.append(Ground(plane, camera, image, known))
+    return found
+
+
+def _softened(witness: Witness, place: np.ndarray, texel: float) -> Witness:
+    """The photo blurred to a texel's size at a place, without the object."""
+    z = float(witness.camera.project(place[None])[1][0])
+    sigma = 0.35 * texel * witness.camera.fx / z if z > 0 else 0.0
+    if sigma < 0.6:
+        return witness
+    shown = (~(witness.hidden | witness.beside)).astype(np.float32)
+    total = cv2.GaussianBlur(witness.photo * shown[..., None], (0, 0), sigma)
+    weight = cv2.GaussianBlur(shown, (0, 0), sigma)
+    return replace(witness, photo=np.clip(total / np.maximum(weight, 1e-3)[..., None], 0, 255).astype(np.uint8))
+
+
+def linear(
+    picture: np.ndarray,  # [..., 3] uint8 sRGB
+) -> np.ndarray:
+    """Linear light in [0, 1] (IEC 61966-2-1)."""
+    x = np.arange(256) / 255.0
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)[picture]
