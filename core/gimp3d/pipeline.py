@@ -28,8 +28,10 @@ from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.growth import Growth
 from .stages.layers import LayerSettings
+from .stages.lifting import Lifted, lift_shadow
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
+from .stages.occluder import Occluder
 from .stages.outline import window_mask
 from .stages.propagate import (
     PaintedView,
@@ -59,6 +61,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
+from .stages.shadow import Ground, Light, Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
 from .threads import parallel_map
@@ -85,6 +88,7 @@ class RemovalSettings:
     refine: RefineSettings = RefineSettings()
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
+    shadow: str = "auto"  # auto | off | mask: what the object's own shadow is taken for
     use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
     extra_references: int = 3  # views completed after the first one, where it does not reach
     extra_gain: float = 0.01  # share of the hole that an extra reference must still find open
@@ -105,6 +109,7 @@ PRESETS: dict[str, RemovalSettings] = {
             largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
         ),
         refine=RefineSettings(steps=3000, patience=120),
+        shadow="off",
         use_evidence=False,
         extra_references=0,
     ),
@@ -134,10 +139,10 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | chart | depth | fit | appearance | mapping | rules
+    kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (hole) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (hole) | (light, lifted) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
     data: tuple[np.ndarray, ...]
 
 
@@ -159,6 +164,7 @@ class RemovalResult:
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
     verdict: Verdict | None = None  # None where nothing was removed
     proposed: dict[str, Any] = field(default_factory=dict)  # what of the object the boxes cut off, see Growth.facts
+    shadow: dict[str, Any] = field(default_factory=lambda: {"found": False})  # see Shadow.facts
 
 
 class Store(Protocol):
@@ -212,6 +218,7 @@ def remove_object(
     progress: Progress = silent,
     store: Store | None = None,
     extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
+    shadow_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, for shadow="mask": its shadow
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
 
@@ -247,8 +254,11 @@ def remove_object(
     open_views = masks.views
     hits: dict[str, Hits] = {}
     charts: tuple[Chart, ...] = ()
+    unlit, lit = scene, _Lit(None, {"found": False, "reason": "not looked for"})
     if settings.charts is not None and masks.mode == "need":
-        charted: Charted = run("charts", lambda: _chart(scene, region, masks, levelled, settings))
+        charted, lit = _charted(run, scene, region, masks, levelled, settings, shadow_masks or {})
+        if lit.lifted is not None:
+            scene, levelled = lit.lifted.scene(scene), lit.photos(masks.views)
         if charted.charts:
             charts, open_views = charted.charts, charted.targets.views
             hits = {v.camera.id: h for v, h in zip(open_views, charted.targets.hits)}
@@ -276,7 +286,7 @@ def remove_object(
         if masks.mode == "paper":
             why = "nothing to fill: what surrounds the box covers its outline in every view"
         verdict = judged(None, masks.views, None)
-        return replace(_finish(run, keep, None, masks, charts, {}, [why]), verdict=verdict)
+        return lit.with_changes(replace(_finish(run, keep, None, masks, charts, {}, [why]), verdict=verdict), unlit)
 
     def emptied(v: ViewMasks) -> np.ndarray:
         """A view's photo with the emptied scene in the object's place."""
@@ -343,14 +353,18 @@ def remove_object(
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
     verdict = judged(added, open_views, done[0] if done and by_picture else None)
 
+    shaded = lit.shaded(masks.views)
+
     def finish(v: ViewMasks) -> None:
         name = v.camera.id
-        painted[name] = exposures[name].back(painted[name], photos[name], v.silhouette | v.target)
+        changed = v.silhouette | v.target | shaded.get(name, False)
+        painted[name] = exposures[name].back(painted[name], photos[name], changed)
 
     parallel_map(finish, masks.views)
     pictures = {r.camera.id: r.image for r in done}
     charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in shown)
-    return replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left, verdict=verdict)
+    result = replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left, verdict=verdict)
+    return lit.with_changes(result, unlit)
 
 
 def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
@@ -386,6 +400,7 @@ def with_charts(
     masks: Masks,
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
     settings: RemovalSettings = RemovalSettings(),
+    shadow_masks: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[Masks, tuple[Chart, ...]]:
     """The masks that a removal really uses, and its charts with what photos show of them (see _to_paint).
 
@@ -394,12 +409,136 @@ def with_charts(
     if settings.charts is None or masks.mode != "need" or not masks.removed.any():
         return masks, ()
     levelled = {name: e.image for name, e in _exposures(scene, masks, photos).items()}
-    charted = _chart(scene, masks.grown(region), masks, levelled, settings)
+    run = _Run(None, silent)
+    charted, _ = _charted(run, scene, masks.grown(region), masks, levelled, settings, shadow_masks or {})
     if not charted.charts:
         return masks, ()
     masks = replace(masks, selection=charted.selection, views=charted.targets.views)
     hits = {v.camera.id: h for v, h in zip(masks.views, charted.targets.hits)}
     return masks, _to_paint(charted.charts, masks.views, hits)
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What is round the object, and where photos show it; tuples are of the masks' views."""
+
+    planes: tuple[Plane, ...]
+    objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
+    marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object
+    confidence: float
+    reason: str
+
+    def witnesses(self, views: Sequence[ViewMasks], photos: Mapping[str, np.ndarray]) -> list[Witness]:
+        return [
+            Witness(v.camera, photos[v.camera.id], o | m, s, v.depth_before)
+            for v, (o, s), m in zip(views, self.objects, self.marked)
+        ]
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """The object's shadow undone, or why it is not."""
+
+    lifted: Lifted | None
+    shadow: dict[str, Any]  # see Shadow.facts
+
+    def photos(self, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
+        assert self.lifted is not None
+        return {v.camera.id: photo for v, photo in zip(views, self.lifted.photos)}
+
+    def shaded(self, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
+        return {v.camera.id: s for v, s in zip(views, self.lifted.shaded)} if self.lifted else {}
+
+    def with_changes(self, result: RemovalResult, scene: Gaussians) -> RemovalResult:
+        """The result with the Gaussians that were in shadow: as any changed row, they are removed and added."""
+        if self.lifted is None or not len(self.lifted.rows):
+            return replace(result, shadow=self.shadow)
+        changed = np.zeros(len(scene), bool)
+        changed[self.lifted.rows] = True
+        changed &= result.keep  # some were taken away since
+        brighter = self.lifted.scene(scene).take(changed)
+        added = brighter if result.added is None else brighter.extended(result.added)
+        return replace(result, keep=result.keep & ~changed, added=added, shadow=self.shadow)
+
+
+def _charted(
+    run: _Run,
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    photos: dict[str, np.ndarray],  # at the splats' exposure
+    settings: RemovalSettings,
+    shadow_masks: Mapping[str, np.ndarray],
+) -> tuple[Charted, _Lit]:
+    """The surfaces that the object hid, without its shadow."""
+    surfaces: Surfaces = run("surfaces", lambda: _surfaces(scene, region, masks, photos, settings))
+    lit = _light(run, scene, region, masks, surfaces, photos, settings, shadow_masks)
+    if lit.lifted is not None:
+        scene, photos = lit.lifted.scene(scene), lit.photos(masks.views)
+        marked = tuple(m | d for m, d in zip(surfaces.marked, lit.lifted.dark))
+        surfaces = replace(surfaces, marked=marked)
+    return run("charts", lambda: _chart(scene, region, masks, surfaces, photos, settings)), lit
+
+
+def _surfaces(
+    scene: Gaussians, region: Region, masks: Masks, photos: Mapping[str, np.ndarray], settings: RemovalSettings
+) -> Surfaces:
+    assert settings.charts is not None
+    views = masks.views
+    # what the user named beside the object, by a mask or a box of its own: masks let no depth stand there
+    marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in views)
+    objects = tuple(object_pixels(scene, masks.removed, views, settings.clearing))
+    found = Surfaces((), objects, marked, 1.0, "")
+    planes = find_planes(views, found.witnesses(views, photos), region, settings.charts)
+    return replace(found, planes=planes, reason=f"{len(planes)} planes run into what the object hid")
+
+
+def _light(
+    run: _Run,
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    surfaces: Surfaces,
+    photos: Mapping[str, np.ndarray],
+    settings: RemovalSettings,
+    shadow_masks: Mapping[str, np.ndarray],
+) -> _Lit:
+    """Find the object's shadow, and undo it."""
+    if settings.shadow == "off":
+        return _Lit(None, {"found": False, "reason": "not looked for"})
+    witnesses = surfaces.witnesses(masks.views, photos)
+
+    def find() -> Found:
+        if settings.shadow == "mask":
+            given = [shadow_masks.get(v.camera.id) for v in masks.views]
+            shadow = marked_shadow(given, surfaces.planes, witnesses, region)
+        else:
+            shadow = find_shadow(scene.take(masks.removed), surfaces.planes, witnesses, region)
+        return Found(None, 0.0, shadow) if isinstance(shadow, str) else Found(shadow, shadow.confidence, shadow.reason)
+
+    found: Found = run("light", find)
+    if found.shadow is None:
+        if settings.shadow == "mask":
+            run.warnings.append(found.reason)
+        return _Lit(None, {"found": False, "reason": found.reason})
+    shadow = found.shadow
+    lifted: Lifted = run("lift", lambda: lift_shadow(scene, masks.removed, shadow, witnesses))
+    facts = {**shadow.facts(), "gaussians": len(lifted.rows), "reason": found.reason}
+    most = sorted(range(len(witnesses)), key=lambda k: -int(lifted.shaded[k].sum()))[:2]
+    for k in most:
+        if lifted.shaded[k].any():
+            title = f"The object's shadow in {witnesses[k].camera.id}: photo, light that arrives, lifted"
+            run.pictures.append(Picture("shadow", title, witnesses[k].photo, (lifted.light[k], lifted.photos[k])))
+    return _Lit(lifted, facts)
+
+
+@dataclass(frozen=True)
+class Found:
+    """The object's shadow, if one is found."""
+
+    shadow: Shadow | None
+    confidence: float
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -417,21 +556,15 @@ def _chart(
     scene: Gaussians,
     region: Region,
     masks: Masks,
-    photos: dict[str, np.ndarray],  # at the splats' exposure
+    surfaces: Surfaces,
+    photos: Mapping[str, np.ndarray],  # at the splats' exposure
     settings: RemovalSettings,
 ) -> Charted:
-    """Find the hidden surfaces, clear the air before them, and say where they have to be filled."""
+    """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
     assert settings.charts is not None
-    views = masks.views
-    # what the user named beside the object, by a mask or a box of its own: masks let no depth stand there
-    marked = [v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in views]
-
-    objects = object_pixels(scene, masks.removed, views, settings.clearing)
-    witnesses = [
-        Witness(v.camera, photos[v.camera.id], o | m, s, v.depth_before) for v, (o, s), m in zip(views, objects, marked)
-    ]
-    planes = find_planes(views, witnesses, region, settings.charts)
-    charts = draw_charts(planes, views, witnesses, region, settings.charts, marked)
+    views, marked = masks.views, surfaces.marked
+    witnesses = surfaces.witnesses(views, photos)
+    charts = draw_charts(surfaces.planes, views, witnesses, region, settings.charts, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
     tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
@@ -972,12 +1105,19 @@ STORED = (
     Camera,
     Chart,
     Charted,
+    Found,
     Gaussians,
+    Ground,
     Growth,
     Hits,
+    Lifted,
+    Light,
     Masks,
+    Occluder,
     Plane,
     Selection,
+    Shadow,
+    Surfaces,
     Targets,
     ViewMasks,
     ReferenceChoice,

@@ -87,7 +87,7 @@ def write_removal_report(
     for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
-        stage_pictures.append((picture.title, name, picture.kind == "rules"))
+        stage_pictures.append((picture.title, name, picture.kind in ("rules", "shadow")))
     page = _page(summary, pairs, flips, stage_pictures, result.charts, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
@@ -111,6 +111,9 @@ def draw(picture: Picture) -> np.ndarray:
     """A stage's result as a picture, [H, W, 3] uint8."""
     if picture.kind in ("mask", "chart"):
         return tinted(picture.image, picture.data[0], (230, 60, 60))
+    if picture.kind == "shadow":
+        light, lifted = picture.data
+        return np.hstack([picture.image, np.repeat(light[..., None], 3, axis=2), lifted])
     if picture.kind == "depth":
         return relief(picture.data[0], picture.data[1])
     if picture.kind == "fit":

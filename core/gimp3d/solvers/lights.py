@@ -85,7 +85,9 @@ class Lit:
             return float((self.weight * (root - 1)).sum()), np.concatenate([shadows.T @ at, -self.besides.T @ slope])
 
         bounds = [(0, 1)] * count + [(None, None)] * self.besides.shape[1]
-        found = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+        found = minimize(
+            loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS}
+        )
         return found.x[:count], found.x[count:], float(found.fun)
 
     def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
@@ -111,6 +113,14 @@ class Lit:
         """[K] what is left of the differences; `darkness` [T] is the share of light that shadows take."""
         lit = np.log(1 - np.minimum(darkness, DARKEST))
         return self.observed - self.operator @ lit - self.besides @ coefficients
+
+    def explained(self, darkness: np.ndarray, coefficients: np.ndarray) -> float:
+        """Share of the squared differences that the darkness explains, where it makes any."""
+        made = self.operator @ np.log(1 - np.minimum(darkness, DARKEST))
+        there = np.abs(made) > LEAST_NOISE
+        before = self.observed - self.besides @ coefficients
+        squares = [(self.weight * there * d**2).sum() for d in (before - made, before)]
+        return float(np.clip(1 - squares[0] / max(squares[1], 1e-12), 0, 1))
 
     def only(self, rows: np.ndarray) -> Lit:
         """With only these differences [K] bool counted."""

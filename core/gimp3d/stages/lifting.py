@@ -34,6 +34,7 @@ class Lifted:
     """A scene and its photos without the object's shadow."""
 
     photos: tuple[np.ndarray, ...]  # [H, W, 3] uint8, of the witnesses
+    light: tuple[np.ndarray, ...]  # [H, W] uint8, of 255: the share of light that arrives in them
     shaded: tuple[np.ndarray, ...]  # [H, W] bool, what changed in them
     dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted
     rows: np.ndarray  # [M] of the scene whose colours changed
@@ -70,7 +71,8 @@ def lift_shadow(
     sh = _matched(scene, removed, rows, sh, witnesses, photos, shaded)
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
-    return Lifted(photos, shaded, dark, rows, sh, shadow.confidence, words)
+    light = tuple(np.rint(a.mean(-1) * 255).astype(np.uint8) for a in arriving)
+    return Lifted(photos, light, shaded, dark, rows, sh, shadow.confidence, words)
 
 
 def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
@@ -93,7 +95,7 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
         for number in np.unique(on[rows, cols]):
             of = (on[rows, cols] == number) & (depth[rows, cols] > 0)
             r, c = rows[of], cols[of]
-            out[r, c] = shadow.arriving(points[r, c], shadow.grounds[number].plane.normal if number >= 0 else None)
+            out[r, c] = shadow.arriving(points[r, c], number)
 
     h, w = depth.shape
     some_rows, some_cols = np.unique([*range(0, h, STRIDE), h - 1]), np.unique([*range(0, w, STRIDE), w - 1])
@@ -105,9 +107,12 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     kernel = np.ones((3, 3), np.uint8)
     dim = few.mean(-1)
     uneven = cv2.dilate(dim, kernel) - cv2.erode(dim, kernel) > EVEN
-    number = on[grid].astype(np.float32)
-    uneven |= (cv2.dilate(number, kernel) != cv2.erode(number, kernel)) & (cv2.erode(dim, kernel) < UNTOUCHED)
-    y, x = (np.interp(np.arange(n), some, np.arange(len(some))).astype(np.float32) for n, some in ((h, some_rows), (w, some_cols)))
+    numbers = on[grid].astype(np.float32)
+    uneven |= (cv2.dilate(numbers, kernel) != cv2.erode(numbers, kernel)) & (cv2.erode(dim, kernel) < UNTOUCHED)
+    y, x = (
+        np.interp(np.arange(n), some, np.arange(len(some))).astype(np.float32)
+        for n, some in ((h, some_rows), (w, some_cols))
+    )
     x, y = np.meshgrid(x, y)
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
@@ -122,13 +127,14 @@ def _shows(witness: Witness, ground: Ground, rays: np.ndarray) -> tuple[np.ndarr
     z = np.where(np.isfinite(z) & (z > 0), z, 0.0)
     uv, _ = ground.camera.project(camera.centre + z[..., None] * rays)
     x, y = (np.nan_to_num(uv, nan=-9.0).astype(np.float32) - 0.5).transpose(2, 0, 1)
-    known = cv2.remap(ground.known.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
+    known, hole = (cv2.remap(m.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0 for m in (ground.known, ground.hole))
     expected = cv2.remap(ground.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
     weight = known.astype(np.float32)
     off = np.abs(expected - witness.photo).max(-1) * weight
     off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)
     same = witness.depth > (1 - SAME) * z
-    return z, (z > 0) & np.where(known, off < ALIKE, same)
+    is_it = np.where(known, off < ALIKE, same | hole).astype(np.uint8)
+    return z, (z > 0) & (cv2.medianBlur(is_it, PATCH) > 0)  # highlights are specks
 
 
 def _brighter(

@@ -18,6 +18,7 @@ SAMPLES = 16  # of every Gaussian, by which it is spread over cells
 FAINT = 0.05  # opacity below which a Gaussian blocks nothing worth telling
 LARGE = 0.25  # of the region's diagonal, from which a Gaussian is no part of an object that size
 LOW = 0.03  # of the diagonal: what is lower is the surface that went along
+STANDS = 0.1  # of the diagonal: an object whose lowest parts are no higher stands on the surface
 STEP = 0.8  # cells that a ray goes at once
 
 
@@ -50,8 +51,8 @@ class Occluder:
         normal = norm.ppf((qmc.Sobol(3, scramble=False).random(SAMPLES) + 0.5 / SAMPLES) % 1)
         points = means[:, None] + np.einsum("nij,sj->nsi", axes, normal)
         low, high = np.percentile(means, 0.5, axis=0), np.percentile(means, 99.5, axis=0)
-        low[2] = max(low[2], 0.0)
         low, high = low - 0.02 * diagonal, high + 0.02 * diagonal
+        low[2] = 0.0 if low[2] < STANDS * diagonal else low[2]
         cell = float((high - low).max()) / CELLS
         shape = np.maximum(1, np.ceil((high - low) / cell)).astype(int)
         index = np.floor((points - low) / cell).astype(int)
@@ -59,7 +60,11 @@ class Occluder:
         area = 2 * np.pi * scales[:, 0] * scales[:, 1] * g.opacity / SAMPLES
         weights = np.broadcast_to(area[:, None], inside.shape)[inside]
         cells = np.bincount(np.ravel_multi_index(tuple(index[inside].T), tuple(shape)), weights, int(shape.prod()))
-        return cls(plane, low, cell, (cells / cell**2).reshape(shape).astype(np.float32))
+        thickness = (cells / cell**2).reshape(shape).astype(np.float32)
+        foot = int(np.ceil((LOW * diagonal - low[2]) / cell))
+        if 0 < foot < shape[2] and low[2] < LOW * diagonal:
+            thickness[:, :, :foot] = thickness[:, :, foot : foot + 1]  # it stands on the plane: no light goes below
+        return cls(plane, low, cell, thickness)
 
     @cached_property
     def size(self) -> np.ndarray:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy.stats import norm
+import scipy.ndimage
 
 from ..box import Region
 from ..camera import Camera
@@ -37,6 +38,9 @@ ASIDE = 1.1  # … so many of its widths away
 EARNS = 1.2  # times what chance explains, that a light must explain
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 DARK = 2e-3  # of linear light, noise of a photo's
+FAINT = 0.03  # share of light below which nothing is a shadow
+EDGES = (0.7, 1.5, 3.0, 6.0)  # texels, σ of the edges that a marked shadow may have
+ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 50  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
@@ -54,6 +58,16 @@ class Light:
     def elevation(self) -> float:
         """Degrees above the support."""
         return math.degrees(math.asin(float(np.clip(self.towards[2], -1, 1))))
+
+    def direction(self, plane: Plane) -> np.ndarray:
+        """[3] unit, scene coordinates, towards the light."""
+        return self.towards @ np.stack([plane.right, plane.down, plane.normal])
+
+    def azimuth(self, plane: Plane) -> float:
+        """Degrees from the scene's x axis towards y (where the support is level in z; y to z, or z to x, else)."""
+        up = int(np.argmax(np.abs(plane.normal)))
+        direction = self.direction(plane)
+        return math.degrees(math.atan2(direction[(up + 2) % 3], direction[(up + 1) % 3]))
 
     def rays(self, count: int = SAMPLES) -> np.ndarray:
         """[count, 3] directions, evenly drawn from the lobe (a sunflower's seeds)."""
@@ -77,29 +91,59 @@ class Ground:
     camera: Camera
     image: np.ndarray  # [H, W, 3] uint8
     known: np.ndarray  # bool, several photos show it, and much the same
+    hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """What the object keeps from its surroundings."""
+    """What the object keeps from its surroundings: told by lights that it stands before, or by a user's masks."""
 
-    lights: tuple[Light, ...]
-    occluder: Occluder
     grounds: tuple[Ground, ...]  # what it may fall on
-    explained: float  # share of what tells the shadow from the surface's texture
+    occluder: Occluder | None  # None: masks tell
+    lights: tuple[Light, ...]
+    marked: tuple[np.ndarray, ...]  # [H, W, 3] float32 each: the share of light that masks say is taken from a ground
+    explained: float  # share of the unevenness of light, where it falls, that it explains
     confidence: float  # 1 less what chance explains over what the lights do
     reason: str
 
     def arriving(
         self,
         points: np.ndarray,  # [N, 3] scene coordinates
-        normal: np.ndarray | None = None,  # [3] unit, of the surface they are on; None: lit from everywhere
+        ground: int = -1,  # that they are on: its index; −1: none
     ) -> np.ndarray:
         """[N, 3] the share of light, per channel, that the object lets through; 1 far from it."""
         taken = np.zeros((len(points), 3))
-        for light in self.lights:
-            taken += _cast(self.occluder, points, normal, light)[:, None] * light.strength
+        if self.occluder is not None:
+            normal = self.grounds[ground].plane.normal if ground >= 0 else None
+            for light in self.lights:
+                taken += _cast(self.occluder, points, normal, light)[:, None] * light.strength
+        elif ground >= 0:
+            uv, _ = self.grounds[ground].camera.project(points)
+            x, y = (uv.astype(np.float32) - np.float32(0.5)).T[:, :, None]
+            taken = cv2.remap(self.marked[ground], x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
         return 1 - np.minimum(taken, 1 - DARK)
+
+    def facts(self) -> dict[str, Any]:
+        """For the summary: lights by degrees, strengths in shares of light."""
+        lights = [
+            {
+                "elevation": round(light.elevation, 2),
+                "azimuth": round(light.azimuth(self.occluder.plane), 2),
+                "softness": round(light.softness, 2),
+                "direction": [round(float(x), 4) for x in light.direction(self.occluder.plane)],
+                "strength": [round(float(x), 3) for x in light.strength],
+            }
+            for light in self.lights
+            if self.occluder is not None and math.isfinite(light.softness)
+        ]
+        sky = [light.strength for light in self.lights if not math.isfinite(light.softness)]
+        return {
+            "found": True,
+            "lights": lights,
+            "sky": [round(float(x), 3) for x in sky[0]] if sky else None,
+            "explained": round(self.explained, 3),
+            "confidence": round(self.confidence, 3),
+        }
 
 
 @dataclass(frozen=True)
@@ -115,7 +159,9 @@ class _Receiver:
         camera = ground.camera
         z = float(camera.project(ground.plane.origin[None])[1][0])
         points = camera.unproject(camera.pixel_centres(), np.full(ground.known.shape, z))
-        return cls(Surface(ground.known, np.log(linear(ground.image) + DARK)), points[ground.known], ground.plane.normal)
+        return cls(
+            Surface(ground.known, np.log(linear(ground.image) + DARK)), points[ground.known], ground.plane.normal
+        )
 
     def halved(self) -> _Receiver:
         """Blocks of four texels, where half of them are known."""
@@ -129,7 +175,10 @@ class _Receiver:
 
         count = blocks(shown)
         known = count[..., 0] >= 2
-        colours, points = (blocks(np.where(shown[..., None], v[:h, :w], 0)) / np.maximum(count, 1) for v in (self.surface.colours, points))
+        colours, points = (
+            blocks(np.where(shown[..., None], v[:h, :w], 0)) / np.maximum(count, 1)
+            for v in (self.surface.colours, points)
+        )
         return replace(self, surface=Surface(known, colours), points=points[known])
 
 
@@ -138,7 +187,6 @@ def find_shadow(
     planes: Sequence[Plane],  # of the surfaces round it, the support first
     witnesses: Sequence[Witness],
     region: Region,
-    tolerance: float,  # relative z within which a view shows a surface
 ) -> Shadow | str:
     """The lights whose shadows of the object explain what is dark round it; or why there is none.
 
@@ -151,7 +199,7 @@ def find_shadow(
     occluder = Occluder.make(gone, planes[0], extent(region))
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
-    grounds = look_at(planes, witnesses, region, tolerance)
+    grounds = look_at(planes, witnesses, region)
     fine = [_Receiver.make(g) for g in grounds]
     receivers = [half for half in (r.halved() for r in fine) if half.surface.shown.sum() >= FEWEST]
     if not receivers:
@@ -167,6 +215,57 @@ def find_shadow(
         return f"no shadow found: the best light explains {ratio:.1f} times what chance does"
     lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
     return _settled(lights, occluder, grounds, fine, ratio)
+
+
+def marked_shadow(
+    masks: Sequence[np.ndarray | None],  # [H, W] bool of the witnesses' views; None where the user marked none
+    planes: Sequence[Plane],
+    witnesses: Sequence[Witness],
+    region: Region,
+) -> Shadow | str:
+    """The shadow that a user marked: where most of the masks see it on a ground, as dark as photos show it there.
+
+    Its edge is as soft as photos show it: shapes of several softnesses share the strength.
+    """
+    grounds = look_at(planes, witnesses, region)
+    if not grounds:
+        return "the marked shadow falls on no surface that photos show: nothing is lifted"
+    receivers = [_Receiver.make(g) for g in grounds]
+    shapes = [_marked_on(ground, masks, witnesses) for ground in grounds]
+    shadows = np.concatenate([s[g.known] for s, g in zip(shapes, grounds)])
+    lit = Lit.make([r.surface for r in receivers], LEVELS)
+    strength, besides, _ = lit.fit(shadows)
+    if strength.sum() < FAINT:
+        return "what is marked as shadow is not darker than what is round it: nothing is lifted"
+    explained = lit.explained(shadows @ strength, besides)
+    tints = strength[:, None] * lit.tints(shadows, strength)
+    words = f"{strength.sum():.0%} of the light is missing where it is marked; {explained:.0%} is explained"
+    return Shadow(
+        tuple(grounds), None, (), tuple((s @ tints).astype(np.float32) for s in shapes), explained, 1.0, words
+    )
+
+
+def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:
+    """[H, W, S] float32: where most masks mark a ground, with edges of several softnesses."""
+    camera = ground.camera
+    z = float(camera.project(ground.plane.origin[None])[1][0])
+    points = camera.unproject(camera.pixel_centres(), np.full(ground.known.shape, z)).reshape(-1, 3)
+    said = ask(witnesses, points, ROUGH)
+    votes, voters = np.zeros(len(points)), np.zeros(len(points))
+    for mask, witness, says in zip(masks, witnesses, said):
+        if mask is None:
+            continue
+        sees = np.isin(says, (Says.SEEN, Says.BESIDE))
+        cols, rows = witness.camera.project(points[sees])[0].astype(int).T
+        votes[sees] += mask[rows, cols]
+        voters[sees] += 1
+    marked = ((2 * votes > voters) & (voters > 0)).reshape(ground.known.shape).astype(np.float32)
+    # what the object hides lies in its shadow, or the edge of the mask beside it would be one of light
+    hole = ((said == Says.HIDDEN).any(0) & (voters == 0)).reshape(ground.known.shape)
+    near = cv2.dilate(marked, np.ones((5, 5), np.uint8)) > 0
+    labels, _ = scipy.ndimage.label(hole)
+    marked[np.isin(labels, np.unique(labels[hole & near]))] = 1.0
+    return np.stack([cv2.GaussianBlur(marked, (0, 0), sigma) for sigma in EDGES], -1)
 
 
 @dataclass(frozen=True)
@@ -261,17 +360,18 @@ def _settled(
             lights[k], shadows[:, k] = tries[best], casts[:, best]
         if not moved:
             step /= 2
-    nothing, loss = (lit.fit(shadows[:, :n])[2] for n in (0, count + 1))
     broad = Lit.make([r.surface for r in receivers], BROAD)
-    strength = broad.fit(shadows)[0]
+    strength, besides, _ = broad.fit(shadows)
     tints = broad.tints(shadows, strength)
+    explained = broad.explained(shadows @ strength, besides)
     lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
     words = ", ".join(
-        f"{light.strength.mean():.0%} from {light.elevation:.0f}° above it, soft by {light.softness:.0f}°"
+        f"{light.strength.mean():.0%} of the light comes from {light.elevation:.0f}° above the surface"
+        f" (soft by {light.softness:.0f}°)"
         for light in lights[:count]
     )
-    words += f", {lights[count].strength.mean():.0%} from the sky"
-    return Shadow(tuple(lights), occluder, tuple(grounds), 1 - loss / nothing, 1 - 1 / ratio, words)
+    words += f", {lights[count].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
+    return Shadow(tuple(grounds), occluder, tuple(lights), (), explained, 1 - 1 / ratio, words)
 
 
 def _near(light: Light, step: float) -> list[Light]:
@@ -284,7 +384,10 @@ def _near(light: Light, step: float) -> list[Light]:
         if towards[2] > math.sin(math.radians(LOWEST)):
             found.append(replace(light, towards=towards))
     factor = 1 + step / 8
-    return [*found, *(replace(light, softness=float(np.clip(light.softness * f, 0.5, 45.0))) for f in (factor, 1 / factor))]
+    return [
+        *found,
+        *(replace(light, softness=float(np.clip(light.softness * f, 0.5, 45.0))) for f in (factor, 1 / factor)),
+    ]
 
 
 def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, light: Light) -> np.ndarray:
@@ -326,9 +429,7 @@ def _hemisphere(count: int) -> np.ndarray:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)
 
 
-def look_at(
-    planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, tolerance: float
-) -> list[Ground]:
+def look_at(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Ground]:
     """What photos show of the planes round the object, where they show enough."""
     diagonal = extent(region)
     found = []
@@ -337,18 +438,19 @@ def look_at(
         camera, away = facing_camera(plane, plane.origin, np.full(2, side), diagonal / DENSITY)
         points = camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), away))
         softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
-        said = ask(softened, points.reshape(-1, 3), tolerance).reshape(-1, camera.height, camera.width)
+        said = ask(softened, points.reshape(-1, 3), ROUGH).reshape(-1, camera.height, camera.width)
         image, spread = mosaic(points, plane.normal, softened, said)
         photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
         known = shown_there(said) & (photos > 1)
         known &= spread < VIEWED * usual_spread(spread[known])
         hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
-        known &= cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) == 0
+        hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
+        known &= ~hole
         for other in planes:
             if abs(other.normal @ plane.normal) <= PARALLEL:
                 known &= other.local(points.reshape(-1, 3))[:, 2].reshape(known.shape) > 0
         if known.sum() >= FEWEST:
-            found.append(Ground(plane, camera, image, known))
+            found.append(Ground(plane, camera, image, known, hole))
     return found
 
 
