@@ -47,14 +47,18 @@ class Lit:
     hues: np.ndarray  # [K, 3] differences of a channel's log less that of luminance
 
     @classmethod
-    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int]) -> Lit:
-        """`levels` are sides of blocks, in texels."""
+    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int], bent: bool = True) -> Lit:
+        """`levels` are sides of blocks, in texels; `bent`: light may change over a surface as a quadratic does.
+
+        A light nearby makes that, and it is no shadow. But wide shadows of the sky look like it: to measure those,
+        light must not be bent.
+        """
         operators, besides, groups = [], [], []
         for number, surface in enumerate(surfaces):
             operator, group = _differences(surface.shown, levels)
             operators.append(operator)
             groups.append(group + 1000 * number)
-            besides.append(_besides(surface))
+            besides.append(_besides(surface, bent))
         operator = sparse.block_diag(operators).tocsr()
         group = np.concatenate(groups)
         colours = np.concatenate([s.colours[s.shown] for s in surfaces])
@@ -65,6 +69,8 @@ class Lit:
         noise = _usual(observed - other @ _explained(observed, other, group), group)
         colourful = np.abs(hues).max(1)
         weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
+        scaled = np.linalg.qr(other * (np.sqrt(weight) / noise)[:, None], mode="r")
+        other = scipy.linalg.solve_triangular(scaled + 1e-6 * np.eye(len(scaled)), other.T, trans="T").T  # for L-BFGS
         return cls(operator, observed, other, noise, weight, hues)
 
     def fit(self, shadows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -73,7 +79,9 @@ class Lit:
         Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
         count = shadows.shape[1]
-        shadows = shadows.astype(np.float64)
+        changes = self.operator @ shadows.astype(np.float64)
+        scale = 1 / (np.sqrt(self.weight @ (changes / self.noise[:, None]) ** 2) + 1e-9)  # all are as steep, about
+        shadows = shadows * scale
 
         def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
             taken = shadows @ x[:count]
@@ -84,11 +92,10 @@ class Lit:
             at = (self.operator.T @ slope) / left * (taken < DARKEST)
             return float((self.weight * (root - 1)).sum()), np.concatenate([shadows.T @ at, -self.besides.T @ slope])
 
-        bounds = [(0, 1)] * count + [(None, None)] * self.besides.shape[1]
-        found = minimize(
-            loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS}
-        )
-        return found.x[:count], found.x[count:], float(found.fun)
+        bounds = [(0, 1 / s) for s in scale] + [(None, None)] * self.besides.shape[1]
+        start = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
+        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+        return found.x[:count] * scale, found.x[count:], float(found.fun)
 
     def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """[S, 3] by what strengths [S] of shadows [T, S] differ between the channels: their mean is about 1."""
@@ -160,14 +167,15 @@ def _differences(shown: np.ndarray, levels: Sequence[int]) -> tuple[sparse.csr_m
     return sparse.vstack(parts).tocsr(), np.concatenate(kinds)
 
 
-def _besides(surface: Surface) -> np.ndarray:
-    """[T, 10]: quadratic in place, and in hue (which light keeps, so that what goes with it is the surface's own)."""
+def _besides(surface: Surface, bent: bool) -> np.ndarray:
+    """[T, B]: linear or quadratic in place, quadratic in hue (which light keeps, so that what goes with it is the surface's own)."""
     y, x = (2 * i[surface.shown] / max(surface.shown.shape) - 1 for i in np.indices(surface.shown.shape))
     colours = surface.colours[surface.shown]
     hues = colours[:, [0, 2]] - colours[:, 1:2]
     spread = hues.std(0) + 1e-3
     a, b = np.clip((hues - np.median(hues, axis=0)) / spread, -SPREAD, SPREAD).T
-    return np.stack([x, y, x * x, x * y, y * y, a, b, a * a, a * b, b * b], axis=1)
+    curves = [x * x, x * y, y * y] if bent else []
+    return np.stack([x, y, *curves, a, b, a * a, a * b, b * b], axis=1)
 
 
 def _usual(values: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The object's shadow: the light that it keeps from surfaces, found by casting its own Gaussians from every direction."""
+"""The object's shadow: the light that it keeps from surfaces, found by casting its own Gaussians from all sides."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from .mosaic import mosaic
 from .occluder import Occluder
 from .witness import Says, Witness, ask
 
+FINER = 2  # times as many along a side, in which it is stored
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
 DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
 LEVELS = (2, 4, 8, 16)  # texels: sides of blocks whose luminance is compared …
@@ -35,7 +36,7 @@ MOST = 3  # lights
 COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled
 ELSEWHERE = 8  # places of the object that it might as well have …
 ASIDE = 1.1  # … so many of its widths away
-EARNS = 1.2  # times what chance explains, that a light must explain
+EARNS = 1.15  # times what chance explains, that a light must explain
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 DARK = 2e-3  # of linear light, noise of a photo's
 FAINT = 0.03  # share of light below which nothing is a shadow
@@ -93,6 +94,12 @@ class Ground:
     known: np.ndarray  # bool, several photos show it, and much the same
     hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
 
+    def points(self, scale: float = 1) -> np.ndarray:
+        """[h, w, 3] scene coordinates of its texels, or of smaller ones."""
+        camera = self.camera.scaled(scale)
+        z = float(camera.project(self.plane.origin[None])[1][0])
+        return camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), z))
+
 
 @dataclass(frozen=True)
 class Shadow:
@@ -101,7 +108,7 @@ class Shadow:
     grounds: tuple[Ground, ...]  # what it may fall on
     occluder: Occluder | None  # None: masks tell
     lights: tuple[Light, ...]
-    marked: tuple[np.ndarray, ...]  # [H, W, 3] float32 each: the share of light that masks say is taken from a ground
+    taken: tuple[np.ndarray, ...]  # [h, w, 3] float32 each: the share of light taken from a ground, all over its picture
     explained: float  # share of the unevenness of light, where it falls, that it explains
     confidence: float  # 1 less what chance explains over what the lights do
     reason: str
@@ -112,16 +119,15 @@ class Shadow:
         ground: int = -1,  # that they are on: its index; −1: none
     ) -> np.ndarray:
         """[N, 3] the share of light, per channel, that the object lets through; 1 far from it."""
-        taken = np.zeros((len(points), 3))
-        if self.occluder is not None:
-            normal = self.grounds[ground].plane.normal if ground >= 0 else None
-            for light in self.lights:
-                taken += _cast(self.occluder, points, normal, light)[:, None] * light.strength
-        elif ground >= 0:
+        if ground >= 0:
+            taken, (h, w) = self.taken[ground], self.grounds[ground].known.shape
             uv, _ = self.grounds[ground].camera.project(points)
-            x, y = (uv.astype(np.float32) - np.float32(0.5)).T[:, :, None]
-            taken = cv2.remap(self.marked[ground], x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
-        return 1 - np.minimum(taken, 1 - DARK)
+            at = uv * [taken.shape[1] / w, taken.shape[0] / h] - 0.5
+            x, y = at.astype(np.float32).T[:, :, None]
+            return 1 - cv2.remap(taken, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
+        if self.occluder is None:
+            return np.ones((len(points), 3))
+        return 1 - _taken(self.occluder, self.lights, points)
 
     def facts(self) -> dict[str, Any]:
         """For the summary: lights by degrees, strengths in shares of light."""
@@ -144,6 +150,16 @@ class Shadow:
             "explained": round(self.explained, 3),
             "confidence": round(self.confidence, 3),
         }
+
+
+def _taken(
+    occluder: Occluder, lights: Sequence[Light], points: np.ndarray, normal: np.ndarray | None = None
+) -> np.ndarray:
+    """[N, 3] the share of light, per channel, that does not arrive at points of a surface."""
+    taken = np.zeros((len(points), 3))
+    for light in lights:
+        taken += _cast(occluder, points, normal, light)[:, None] * light.strength
+    return np.minimum(taken, 1 - DARK)
 
 
 @dataclass(frozen=True)
@@ -212,7 +228,7 @@ def find_shadow(
     moved = [sky.cast(occluder.moved(step * math.cos(a), step * math.sin(a)), receivers) for a in around]
     found, ratio = _earning(lit, shadows, moved)
     if not found:
-        return f"no shadow found: the best light explains {ratio:.1f} times what chance does"
+        return f"no shadow found: the best light explains {ratio:.2f} times what chance does"
     lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
     return _settled(lights, occluder, grounds, fine, ratio)
 
@@ -247,9 +263,7 @@ def marked_shadow(
 
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:
     """[H, W, S] float32: where most masks mark a ground, with edges of several softnesses."""
-    camera = ground.camera
-    z = float(camera.project(ground.plane.origin[None])[1][0])
-    points = camera.unproject(camera.pixel_centres(), np.full(ground.known.shape, z)).reshape(-1, 3)
+    points = ground.points().reshape(-1, 3)
     said = ask(witnesses, points, ROUGH)
     votes, voters = np.zeros(len(points)), np.zeros(len(points))
     for mask, witness, says in zip(masks, witnesses, said):
@@ -360,7 +374,7 @@ def _settled(
             lights[k], shadows[:, k] = tries[best], casts[:, best]
         if not moved:
             step /= 2
-    broad = Lit.make([r.surface for r in receivers], BROAD)
+    broad = Lit.make([r.surface for r in receivers], BROAD, bent=False)
     strength, besides, _ = broad.fit(shadows)
     tints = broad.tints(shadows, strength)
     explained = broad.explained(shadows @ strength, besides)
@@ -371,7 +385,12 @@ def _settled(
         for light in lights[:count]
     )
     words += f", {lights[count].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
-    return Shadow(tuple(grounds), occluder, tuple(lights), (), explained, 1 - 1 / ratio, words)
+    fine = [g.points(FINER) for g in grounds]
+    taken = tuple(
+        _taken(occluder, lights, p.reshape(-1, 3), g.plane.normal).reshape(p.shape).astype(np.float32)
+        for g, p in zip(grounds, fine)
+    )
+    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, 1 - 1 / ratio, words)
 
 
 def _near(light: Light, step: float) -> list[Light]:
