@@ -180,7 +180,7 @@ def measured(scene: Scene, run: Run, folder: Path, reuse: bool) -> dict[str, Any
     render_views(out, scene.folder / "transforms.json", folder / "render", **drawn)
     if scene.has_truth:
         file = read_ply(out)
-        new = np.arange(len(file.gaussians)) >= counts["gaussians_out"] - counts["added"]
+        new = np.arange(len(file.gaussians)) >= counts["gaussians_out"] - counts["added"] + counts["lifted"]
         views = [(c, scene.covered(c, run.marked)) for c in scene.train]
         astray = outside_hidden_volume(file.gaussians.means[new], views)
         row |= {"outside": float(astray.mean()) if new.any() else 0.0, **scored(scene, folder / "render")}

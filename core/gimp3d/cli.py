@@ -24,9 +24,12 @@ from .errors import BadInput, Cancelled, Gimp3dError
 from .job import RemovalJob, load_job, save_job
 
 Namespace = argparse.Namespace
+SHADOWS = ("auto", "off", "mask")  # as in commands, which takes a second to import
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
 IMAGES = "photos; none: views are rendered from the scene"
 GROW = "take along what of the object the boxes cut off"
+SHADOW = "the object's own shadow: found and undone where its light is clear, left, or as marked by --shadow-masks"
+SHADOW_MASKS = "white pixels of DIR/<ID without extension>.png are the object's shadow (--shadow mask)"
 EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
 
 
@@ -67,6 +70,8 @@ def build_parser() -> argparse.ArgumentParser:
     masks.add_argument("--grow", action="store_true", help=GROW)
     masks.add_argument("--mode", choices=("need", "paper"), default="need")
     masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
+    masks.add_argument("--shadow", choices=SHADOWS, default="auto", help=SHADOW)
+    masks.add_argument("--shadow-masks", metavar="DIR", help=SHADOW_MASKS)
     masks.add_argument(
         "--pictures",
         metavar="DIR",
@@ -85,6 +90,8 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--images", metavar="DIR|none", help=IMAGES)
     remove.add_argument("--grow", action="store_true", help=GROW)
     remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
+    remove.add_argument("--shadow", choices=SHADOWS, default="auto", help=SHADOW)
+    remove.add_argument("--shadow-masks", metavar="DIR", help=SHADOW_MASKS)
     remove.add_argument(
         "--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)"
     )
@@ -245,6 +252,8 @@ def _masks(given: Namespace, shown: Reporter) -> None:
         split=given.split,
         frames=_names(given.frames),
         extra_masks=Path(given.extra_masks) if given.extra_masks else None,
+        shadow=given.shadow,
+        shadow_masks=Path(given.shadow_masks) if given.shadow_masks else None,
         pictures=Path(given.pictures) if given.pictures else None,
         depth_prior=given.depth_prior,
         threads=given.threads,

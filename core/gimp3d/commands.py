@@ -44,6 +44,7 @@ from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
 
+SHADOWS = ("auto", "off", "mask")
 PASSES = ("rgb", "alpha", "depth", "normal")
 
 
@@ -147,6 +148,8 @@ def write_masks(
     split: str = "train",
     frames: Sequence[str] | None = None,
     extra_masks: Path | None = None,
+    shadow: str = "auto",
+    shadow_masks: Path | None = None,
     pictures: Path | None = None,
     depth_prior: str = "auto",
     threads: int | None = None,
@@ -169,6 +172,7 @@ def write_masks(
     loaded, _ = _load_views(looked_at, images, gaussians)
     photos = {v.camera.id: v.image for v in loaded}
     settings = RemovalSettings(masks=MaskSettings(mode=mode, grow=grow), depth_prior=depth_prior)
+    settings = replace(settings, shadow=_shadow(shadow, shadow_masks))
     found = find_masks(
         gaussians,
         region,
@@ -176,12 +180,16 @@ def write_masks(
         settings.masks,
         progress,
         photos,
-        _read_extra_masks(extra_masks, looked_at),
+        _read_marks("--extra-masks", extra_masks, looked_at),
     )
-    found, charts = with_charts(gaussians, region, found, photos, settings)
+    marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
+    found, charts, lit = with_charts(gaussians, region, found, photos, settings, marked)
     if pictures:
         proposed = json.dumps(found.proposed)
         write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
+    if pictures:
+        shadow_facts = json.dumps(lit.shadow)
+        write_atomically(pictures / "shadow.json", lambda f: f.write(shadow_facts.encode()))
     if pictures and all(c.split == "train" for c in written):
         write_charts(pictures / "charts", charts)
     views = {v.camera.id: v for v in found.views}
@@ -192,7 +200,7 @@ def write_masks(
         write_png(target.with_name(target.name + ".png"), view.target if view else empty)
         if pictures and view:
             target = pictures / output_name(camera.id)
-            for looked in preview(view, found.views, photos[camera.id], settings):
+            for looked in (*preview(view, found.views, photos[camera.id], settings), *lit.pictures(found.views, view)):
                 write_png(target.with_name(f"{target.name}.{looked.kind}.png"), draw(looked))
 
 
@@ -240,11 +248,14 @@ def run_removal(
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     given = read_image(Path(job.reference_image)) if job.reference_image else None
-    extra = _read_extra_masks(Path(job.extra_masks) if job.extra_masks else None, cameras)
+    extra, shadow = (
+        _read_marks(option, Path(folder) if folder else None, cameras)
+        for option, folder in (("--extra-masks", job.extra_masks), ("--shadow-masks", job.shadow_masks))
+    )
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
-    store = StageStore(folder / "stages", _job_key(job, views, extra), STORED, resume) if folder else None
+    store = StageStore(folder / "stages", _job_key(job, views, (extra, shadow)), STORED, resume) if folder else None
     result = remove_object(
-        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store, extra
+        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store, extra, shadow
     )
     write_ply(out, file, result.keep, result.added)
     if job.views_out:
@@ -274,9 +285,22 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
         raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
     settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
     settings = replace(settings, masks=replace(settings.masks, grow=job.grow))
+    shadow = _shadow(job.shadow, job.shadow_masks)
+    if settings.shadow == "off" and shadow == "mask":
+        raise BadInput(f"--shadow mask: the preset {job.preset} leaves shadows alone; use another preset")
+    if settings.shadow != "off":
+        settings = replace(settings, shadow=shadow)
     for key, text in job.set.items():
         settings = _with(settings, key.split("."), text, key)
     return settings
+
+
+def _shadow(shadow: str, masks: Path | str | None) -> str:
+    if shadow not in SHADOWS:
+        raise BadInput(f"--shadow: {shadow!r} is not one of {', '.join(SHADOWS)}")
+    if (shadow == "mask") != (masks is not None):
+        raise BadInput("--shadow mask and --shadow-masks DIR go together")
+    return shadow
 
 
 def _with(settings: Any, path: Sequence[str], text: str, key: str) -> Any:
@@ -338,14 +362,14 @@ def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
 
 
-def _read_extra_masks(folder: Path | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+def _read_marks(option: str, folder: Path | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
     """The masks of a folder by camera ID, undistorted and resampled like photos; views may lack one."""
     if folder is None:
         return {}
     paths = {c.id: folder / f"{output_name(c.id)}.png" for c in cameras}
     masks = {c.id: load_view(replace(c, image=paths[c.id]))[0].max(-1) > 127 for c in cameras if paths[c.id].is_file()}
     if not masks:
-        raise BadInput(f"--extra-masks: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
+        raise BadInput(f"{option}: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
     return masks
 
 
@@ -378,6 +402,7 @@ def _summary(
             "removed": removed,
             "added": added,
             "gaussians_out": len(file.gaussians) - removed + added,
+            "lifted": result.shadow.get("gaussians", 0),
             **_cost(file, result.added),
             "views": result.views,
             "hole_pixels": result.hole_pixels,
@@ -386,6 +411,7 @@ def _summary(
         "verdict": asdict(result.verdict) if result.verdict else None,
         "selection": result.selection,
         "proposed": result.proposed,
+        "shadow": result.shadow,
         "charts": [
             {
                 "kind": chart.kind,
@@ -425,12 +451,14 @@ def peak_memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _job_key(job: RemovalJob, views: Sequence[View], extra: Mapping[str, np.ndarray]) -> str:
+def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:
     """A hash of everything that a stage's result depends on."""
     digest = hashlib.sha256(__version__.encode())
     free = ("out", "views_out", "report", "summary", "threads", "device")
     files = ("scene", "cameras", "roi", "reference_image")
-    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks")}
+    settings = {
+        k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks", "shadow_masks")
+    }
     digest.update(json.dumps(settings, sort_keys=True).encode())
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
@@ -444,8 +472,8 @@ def _job_key(job: RemovalJob, views: Sequence[View], extra: Mapping[str, np.ndar
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
         digest.update(view.image.tobytes())
-        if view.camera.id in extra:
-            digest.update(extra[view.camera.id].tobytes())
+        for mark in marks:
+            digest.update(mark[view.camera.id].tobytes() if view.camera.id in mark else b"none")
     return digest.hexdigest()
 
 

@@ -31,6 +31,8 @@ class RemovalJob:
     out: str
     images: str | None = None  # folder; "none": views are rendered from the scene itself
     extra_masks: str | None = None  # folder of masks that are filled too: shadows, reflections
+    shadow: str = "auto"  # auto | off | mask
+    shadow_masks: str | None = None  # folder of masks of the object's shadow
     reference: str | None = None
     reference_image: str | None = None
     inpaint: str = "exemplar"
@@ -46,7 +48,7 @@ class RemovalJob:
     grow: bool = False  # take along what of the object the boxes cut off
 
     PATHS = (
-        *("scene", "cameras", "roi", "out", "images", "extra_masks"),
+        *("scene", "cameras", "roi", "out", "images", "extra_masks", "shadow_masks"),
         *("reference_image", "views_out", "report", "summary"),
     )
 

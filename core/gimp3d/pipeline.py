@@ -142,7 +142,8 @@ class Picture:
     kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (hole) | (light, lifted) | (depth, target) | (ring, line, s_f) | (target) | (rows, cols) | (rules, raw)
+    # per kind: (target) | (hole) | (light that arrives, lifted) | (depth, target) | (ring, line, s_f) | (target)
+    # | (rows, cols) | (rules, raw)
     data: tuple[np.ndarray, ...]
 
 
@@ -164,7 +165,7 @@ class RemovalResult:
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate
     verdict: Verdict | None = None  # None where nothing was removed
     proposed: dict[str, Any] = field(default_factory=dict)  # what of the object the boxes cut off, see Growth.facts
-    shadow: dict[str, Any] = field(default_factory=lambda: {"found": False})  # see Shadow.facts
+    shadow: dict[str, Any] = field(default_factory=dict)  # see Shadow.facts
 
 
 class Store(Protocol):
@@ -246,7 +247,7 @@ def remove_object(
     region = masks.grown(region)
     if not masks.removed.any():
         none = ["nothing to remove: the region holds no Gaussian"]
-        return _finish(run, ~masks.removed, None, masks, (), {}, none)
+        return NOT_LIT.with_changes(_finish(run, ~masks.removed, None, masks, (), {}, none), scene)
     if masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
     exposures = _exposures(scene, masks, photos)
@@ -254,7 +255,7 @@ def remove_object(
     open_views = masks.views
     hits: dict[str, Hits] = {}
     charts: tuple[Chart, ...] = ()
-    unlit, lit = scene, _Lit(None, {"found": False, "reason": "not looked for"})
+    unlit, lit = scene, NOT_LIT
     if settings.charts is not None and masks.mode == "need":
         charted, lit = _charted(run, scene, region, masks, levelled, settings, shadow_masks or {})
         if lit.lifted is not None:
@@ -401,21 +402,21 @@ def with_charts(
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
     settings: RemovalSettings = RemovalSettings(),
     shadow_masks: Mapping[str, np.ndarray] | None = None,
-) -> tuple[Masks, tuple[Chart, ...]]:
-    """The masks that a removal really uses, and its charts with what photos show of them (see _to_paint).
+) -> tuple[Masks, tuple[Chart, ...], Lit]:
+    """The masks that a removal really uses, its charts with what photos show of them (see _to_paint), and the shadow.
 
     If there are any, the masks' targets are what no photo shows of them.
     """
     if settings.charts is None or masks.mode != "need" or not masks.removed.any():
-        return masks, ()
+        return masks, (), NOT_LIT
     levelled = {name: e.image for name, e in _exposures(scene, masks, photos).items()}
     run = _Run(None, silent)
-    charted, _ = _charted(run, scene, masks.grown(region), masks, levelled, settings, shadow_masks or {})
+    charted, lit = _charted(run, scene, masks.grown(region), masks, levelled, settings, shadow_masks or {})
     if not charted.charts:
-        return masks, ()
+        return masks, (), lit
     masks = replace(masks, selection=charted.selection, views=charted.targets.views)
     hits = {v.camera.id: h for v, h in zip(masks.views, charted.targets.hits)}
-    return masks, _to_paint(charted.charts, masks.views, hits)
+    return masks, _to_paint(charted.charts, masks.views, hits), lit
 
 
 @dataclass(frozen=True)
@@ -436,7 +437,7 @@ class Surfaces:
 
 
 @dataclass(frozen=True)
-class _Lit:
+class Lit:
     """The object's shadow undone, or why it is not."""
 
     lifted: Lifted | None
@@ -448,6 +449,15 @@ class _Lit:
 
     def shaded(self, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
         return {v.camera.id: s for v, s in zip(views, self.lifted.shaded)} if self.lifted else {}
+
+    def pictures(self, views: Sequence[ViewMasks], shown: ViewMasks) -> list[Picture]:
+        """A view's photo, the light that arrives, and the photo without the shadow; nothing if none falls there."""
+        for k, view in enumerate(views):
+            if view.camera.id == shown.camera.id and self.lifted is not None and self.lifted.shaded[k].any():
+                title = f"The object's shadow in {view.camera.id}: photo, light that arrives, lifted"
+                lifted = self.lifted
+                return [Picture("shadow", title, lifted.before[k], (lifted.light[k], lifted.photos[k]))]
+        return []
 
     def with_changes(self, result: RemovalResult, scene: Gaussians) -> RemovalResult:
         """The result with the Gaussians that were in shadow: as any changed row, they are removed and added."""
@@ -461,6 +471,9 @@ class _Lit:
         return replace(result, keep=result.keep & ~changed, added=added, shadow=self.shadow)
 
 
+NOT_LIT = Lit(None, {"found": False, "lights": [], "explained": 0.0, "reason": "not looked for"})
+
+
 def _charted(
     run: _Run,
     scene: Gaussians,
@@ -469,7 +482,7 @@ def _charted(
     photos: dict[str, np.ndarray],  # at the splats' exposure
     settings: RemovalSettings,
     shadow_masks: Mapping[str, np.ndarray],
-) -> tuple[Charted, _Lit]:
+) -> tuple[Charted, Lit]:
     """The surfaces that the object hid, without its shadow."""
     surfaces: Surfaces = run("surfaces", lambda: _surfaces(scene, region, masks, photos, settings))
     lit = _light(run, scene, region, masks, surfaces, photos, settings, shadow_masks)
@@ -502,10 +515,10 @@ def _light(
     photos: Mapping[str, np.ndarray],
     settings: RemovalSettings,
     shadow_masks: Mapping[str, np.ndarray],
-) -> _Lit:
+) -> Lit:
     """Find the object's shadow, and undo it."""
     if settings.shadow == "off":
-        return _Lit(None, {"found": False, "reason": "not looked for"})
+        return NOT_LIT
     witnesses = surfaces.witnesses(masks.views, photos)
 
     def find() -> Found:
@@ -520,16 +533,13 @@ def _light(
     if found.shadow is None:
         if settings.shadow == "mask":
             run.warnings.append(found.reason)
-        return _Lit(None, {"found": False, "reason": found.reason})
+        return Lit(None, {**NOT_LIT.shadow, "reason": found.reason})
     shadow = found.shadow
     lifted: Lifted = run("lift", lambda: lift_shadow(scene, masks.removed, shadow, witnesses))
-    facts = {**shadow.facts(), "gaussians": len(lifted.rows), "reason": found.reason}
-    most = sorted(range(len(witnesses)), key=lambda k: -int(lifted.shaded[k].sum()))[:2]
-    for k in most:
-        if lifted.shaded[k].any():
-            title = f"The object's shadow in {witnesses[k].camera.id}: photo, light that arrives, lifted"
-            run.pictures.append(Picture("shadow", title, witnesses[k].photo, (lifted.light[k], lifted.photos[k])))
-    return _Lit(lifted, facts)
+    lit = Lit(lifted, {**shadow.facts(), "gaussians": len(lifted.rows), "reason": found.reason})
+    most = sorted(masks.views, key=lambda v: -int(lit.shaded(masks.views)[v.camera.id].sum()))
+    run.pictures += [picture for v in most[:2] for picture in lit.pictures(masks.views, v)]
+    return lit
 
 
 @dataclass(frozen=True)

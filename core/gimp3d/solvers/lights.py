@@ -19,6 +19,7 @@ CHROMA = 3.0  # times the usual difference of colour, from which an edge is hard
 DARKEST = 0.95  # share of light that shadows may take together
 ROUNDS = 6  # of reweighting
 STEPS = 60  # of L-BFGS
+NORMAL = 0.265  # mean of √(1 + u²) − 1 for normal u
 TINTS, TINTLESS = (0.7, 1.3), 40.0  # by which channels' strengths may differ, and how far that is held at 1
 SPREAD = 3.0  # standard deviations of colour beyond which more does not tell more
 
@@ -116,6 +117,15 @@ class Lit:
         found = [minimize(loss, start, (c,), jac=True, method="L-BFGS-B", bounds=bounds).x for c in range(3)]
         return np.stack(found, 1)
 
+    def loss(self, residual: np.ndarray) -> float:
+        """See fit."""
+        return float((self.weight * (np.sqrt(1 + (residual / self.noise) ** 2) - 1)).sum())
+
+    @property
+    def usual_loss(self) -> float:
+        """Of residuals that are noise."""
+        return NORMAL * float(self.weight.sum())
+
     def residual(self, darkness: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         """[K] what is left of the differences; `darkness` [T] is the share of light that shadows take."""
         lit = np.log(1 - np.minimum(darkness, DARKEST))
@@ -168,7 +178,7 @@ def _differences(shown: np.ndarray, levels: Sequence[int]) -> tuple[sparse.csr_m
 
 
 def _besides(surface: Surface, bent: bool) -> np.ndarray:
-    """[T, B]: linear or quadratic in place, quadratic in hue (which light keeps, so that what goes with it is the surface's own)."""
+    """[T, B]: linear or quadratic in place, and quadratic in hue: light keeps it, so what goes with it is paint."""
     y, x = (2 * i[surface.shown] / max(surface.shown.shape) - 1 for i in np.indices(surface.shown.shape))
     colours = surface.colours[surface.shown]
     hues = colours[:, [0, 2]] - colours[:, 1:2]

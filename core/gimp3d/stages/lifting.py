@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..gaussians import SH_C0, Gaussians
-from ..raster import label_weights, pixel_region
+from ..raster import PixelRegion, label_weights, pixel_region
 from ..threads import parallel_map
 from .seed import missing_colours
 from .shadow import Ground, Shadow, linear
@@ -33,7 +33,8 @@ SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 class Lifted:
     """A scene and its photos without the object's shadow."""
 
-    photos: tuple[np.ndarray, ...]  # [H, W, 3] uint8, of the witnesses
+    before: tuple[np.ndarray, ...]  # [H, W, 3] uint8, the witnesses' photos …
+    photos: tuple[np.ndarray, ...]  # [H, W, 3] uint8, … and how they are lifted
     light: tuple[np.ndarray, ...]  # [H, W] uint8, of 255: the share of light that arrives in them
     shaded: tuple[np.ndarray, ...]  # [H, W] bool, what changed in them
     dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted
@@ -72,7 +73,8 @@ def lift_shadow(
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
     light = tuple(np.rint(a.mean(-1) * 255).astype(np.uint8) for a in arriving)
-    return Lifted(photos, light, shaded, dark, rows, sh, shadow.confidence, words)
+    before = tuple(w.photo for w in witnesses)
+    return Lifted(before, photos, light, shaded, dark, rows, sh, shadow.confidence, words)
 
 
 def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
@@ -196,12 +198,15 @@ def _matched(
     most = sorted(range(len(witnesses)), key=lambda k: -int(shaded[k].sum()))[:LOOKS]
     wanted = [shaded[k] & ~witnesses[k].beside for k in most]
     looks = [(k, w) for k, w in zip(most, wanted) if w.any()]
-    regions = parallel_map(lambda l: pixel_region(rest, witnesses[l[0]].camera, l[1], passes=frozenset({"rgb"})), looks)
+    regions = parallel_map(lambda p: pixel_region(rest, witnesses[p[0]].camera, p[1], passes=frozenset({"rgb"})), looks)
+
+    def step(colours: Gaussians, region: PixelRegion, look: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        return missing_colours(region, colours, look[1], photos[look[0]])
+
     for _ in range(CORRECTIONS):
-        steps = parallel_map(lambda p: missing_colours(p[0], lit, p[1][1], photos[p[1][0]]), zip(regions, looks))
-        change = sum(s[1] for s in steps) / (sum(s[0] for s in steps) + HOLD)
+        steps = parallel_map(lambda p: step(*p), [(lit, region, look) for region, look in zip(regions, looks)])
         corrected = lit.sh.copy()
-        corrected[:, 0] += change
+        corrected[:, 0] += sum(s[1] for s in steps) / (sum(s[0] for s in steps) + HOLD)
         lit = replace(lit, sh=corrected)
     return lit.sh
 

@@ -73,7 +73,7 @@ class Occluder:
 
     def moved(self, x: float, y: float) -> Occluder:
         """The same object elsewhere on the plane."""
-        return replace(self, low=self.low + [x, y, 0.0])
+        return replace(self, low=self.low + np.array([x, y, 0.0]))
 
     def blocked(
         self,

@@ -33,10 +33,12 @@ ROUND = (384, 160, 32)  # … and how many of each
 SAMPLES = 48  # rays to a light
 SKY = 96  # and to the sky
 MOST = 3  # lights
-COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled
+COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled …
+MOST_ROUNDS = 8  # … each so often at most
 ELSEWHERE = 8  # places of the object that it might as well have …
 ASIDE = 1.1  # … so many of its widths away
-EARNS = 1.15  # times what chance explains, that a light must explain
+EARNS = 1.3  # times what chance explains, that a light must explain …
+FITS = 0.52  # … and the share of what is uneven where its shadow falls
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 DARK = 2e-3  # of linear light, noise of a photo's
 FAINT = 0.03  # share of light below which nothing is a shadow
@@ -108,7 +110,9 @@ class Shadow:
     grounds: tuple[Ground, ...]  # what it may fall on
     occluder: Occluder | None  # None: masks tell
     lights: tuple[Light, ...]
-    taken: tuple[np.ndarray, ...]  # [h, w, 3] float32 each: the share of light taken from a ground, all over its picture
+    taken: tuple[
+        np.ndarray, ...
+    ]  # [h, w, 3] float32 each: the share of light taken from a ground, all over its picture
     explained: float  # share of the unevenness of light, where it falls, that it explains
     confidence: float  # 1 less what chance explains over what the lights do
     reason: str
@@ -207,8 +211,9 @@ def find_shadow(
     """The lights whose shadows of the object explain what is dark round it; or why there is none.
 
     Candidates are lobes of light all over the sky. The one that explains most of the differences of luminance round
-    the object is taken, then the next. Texture is explained a little by any shadow: a light must explain clearly more
-    than the best one does for the same object elsewhere on the support, or for brightness in darkness' place.
+    the object is taken, then the next. Texture is explained a little by any shape: a light must explain clearly more
+    than brightness of any such shape does, here or where the object might as well stand. And a stain is dark, too: a
+    light must explain most of what is uneven where its shadow falls.
     """
     if not planes:
         return "no shadow found: no surface is known that it could fall on"
@@ -220,17 +225,34 @@ def find_shadow(
     receivers = [half for half in (r.halved() for r in fine) if half.surface.shown.sum() >= FEWEST]
     if not receivers:
         return "no shadow found: photos do not show the surface round the object"
-    lit = Lit.make([r.surface for r in receivers], LEVELS)
-    sky = _Sky.make()
-    shadows = sky.cast(occluder, receivers)
-    step = ASIDE * float(max(occluder.size[:2]))
-    around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
-    moved = [sky.cast(occluder.moved(step * math.cos(a), step * math.sin(a)), receivers) for a in around]
-    found, ratio = _earning(lit, shadows, moved)
-    if not found:
-        return f"no shadow found: the best light explains {ratio:.2f} times what chance does"
-    lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
-    return _settled(lights, occluder, grounds, fine, ratio)
+    lights, told = _search(_Stage.make(occluder, receivers))
+    if not lights:
+        return (
+            f"no shadow found: the best light explains {told.over_chance:.1f} times what chance does, "
+            f"{told.share:.0%} of what is uneven where its shadow would fall"
+        )
+    stage = _Stage.make(occluder, fine)
+    sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
+    lights = [*stage.settled(lights, [sky], FINEST), sky]
+    casts = stage.casts(lights)
+    broad = Lit.make([r.surface for r in fine], BROAD, bent=False)
+    strength, besides, _ = broad.fit(casts)
+    tints = broad.tints(casts, strength)
+    explained = broad.explained(casts @ strength, besides)
+    lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
+    words = ", ".join(
+        f"{light.strength.mean():.0%} of the light comes from {light.elevation:.0f}° above the surface"
+        f" (soft by {light.softness:.0f}°)"
+        for light in lights[:-1]
+    )
+    words += f", {lights[-1].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
+    maps = [g.points(FINER) for g in grounds]
+    taken = tuple(
+        _taken(occluder, lights, p.reshape(-1, 3), g.plane.normal).reshape(p.shape).astype(np.float32)
+        for g, p in zip(grounds, maps)
+    )
+    confidence = told.share * (1 - 1 / told.over_chance)
+    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, confidence, words)
 
 
 def marked_shadow(
@@ -314,83 +336,110 @@ class _Sky:
         )
 
 
-def _earning(lit: Lit, shadows: np.ndarray, moved: Sequence[np.ndarray]) -> tuple[list[int], float]:
-    """Which candidates are lights, and how many times what chance explains the weakest of them does.
+@dataclass(frozen=True)
+class _Told:
+    """What speaks for a light."""
 
-    Chance is the larger of two: what brightness of the same shapes, here or elsewhere, explains of all that is left,
-    and what the object elsewhere explains of that which the light does: a stain is explained from anywhere.
-    """
-    own, elsewhere = lit.changes(shadows), [lit.changes(m) for m in moved]
+    over_chance: float  # what it explains over what chance does
+    share: float  # of what is uneven where its shadow falls that it explains, texture left out
+
+    @property
+    def enough(self) -> float:
+        """1 or more if it is a light."""
+        return min(self.over_chance / EARNS, self.share / FITS)
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """The object before its surroundings, to be lit."""
+
+    occluder: Occluder
+    receivers: Sequence[_Receiver]
+    lit: Lit
+
+    @classmethod
+    def make(cls, occluder: Occluder, receivers: Sequence[_Receiver]) -> _Stage:
+        return cls(occluder, receivers, Lit.make([r.surface for r in receivers], LEVELS))
+
+    def cast(self, light: Light) -> np.ndarray:
+        """[T] the share of its light that does not arrive."""
+        return np.concatenate([_cast(self.occluder, r.points, r.normal, light) for r in self.receivers])
+
+    def casts(self, lights: Sequence[Light]) -> np.ndarray:
+        return np.stack([self.cast(light) for light in lights], 1)
+
+    def settled(self, lights: Sequence[Light], others: Sequence[Light], finest: float) -> list[Light]:
+        """Directions and softness, precisely: a pattern search, each light for what the rest does not explain."""
+        lights, lit = list(lights), self.lit
+        shadows = self.casts([*lights, *others])
+        step, rounds = COARSEST, 0
+        while step >= finest:
+            moved, rounds = False, rounds + 1
+            strength, besides, _ = lit.fit(shadows)
+            for k in range(len(lights)):
+                rest = np.delete(shadows, k, axis=1) @ np.delete(strength, k)
+                tries = [lights[k], *_near(lights[k], step)]
+                casts = np.concatenate([shadows[:, [k]], self.casts(tries[1:])], axis=1)
+                best = int(lit.gains(lit.changes(casts), lit.residual(rest, besides)).argmax())
+                moved |= best > 0
+                lights[k], shadows[:, k] = tries[best], casts[:, best]
+            if not moved or rounds == MOST_ROUNDS:  # lights that share a shadow might follow one another for ever
+                step, rounds = step / 2, 0
+        return lights
+
+    def told(self, lights: Sequence[Light], bright: Sequence[np.ndarray]) -> list[_Told]:
+        """Of each light beside the others; `bright`: changes that shapes make, first the object's where it stands.
+
+        Chance explains brightness by any of them, or what these lights leave by yet another shadow of the object.
+        """
+        lit, shadows = self.lit, self.casts(lights)
+        changes = lit.changes(shadows)
+        strength, besides, _ = lit.fit(shadows)
+        left = lit.residual(shadows @ strength, besides)
+        chance = max(float(lit.gains(bright[0], left).max()), *(float(lit.gains(b, -left).max()) for b in bright))
+        found = []
+        for k in range(len(lights)):
+            others = np.delete(shadows, k, axis=1)
+            rest, besides, _ = lit.fit(others)
+            without = lit.residual(others @ rest, besides)
+            gain = float(lit.gains(changes[:, [k]], without)[0]) if strength[k] > FAINT else 0.0
+            there = lit.only(np.abs(changes[:, k]) * strength[k] > TOLD * lit.noise)
+            before, after, usual = there.loss(without), there.loss(left), there.usual_loss
+            share = float(np.clip((before - after) / max(before - usual, 1e-12), 0, 1))
+            # lights that take more than all light are none
+            found.append(_Told(gain / max(chance, 1e-12), share / max(1.0, float(strength.sum()))))
+        return found
+
+
+def _search(stage: _Stage) -> tuple[list[Light], _Told]:
+    """The lights, and what speaks for the weakest; or for the best candidate, if there is none."""
+    lit, sky = stage.lit, _Sky.make()
+    shadows = sky.cast(stage.occluder, stage.receivers)
+    own = lit.changes(shadows)
+    step = ASIDE * float(max(stage.occluder.size[:2]))
+    around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
+    moved = [stage.occluder.moved(step * math.cos(a), step * math.sin(a)) for a in around]
+    bright = [own, *(lit.changes(sky.cast(m, stage.receivers)) for m in moved)]
     found: list[int] = []
     for _ in range(MOST):
-        found.append(int(lit.gains(own, _left(lit, shadows, found)[0]).argmax()))
-    ratio = 0.0
-    while found:
-        left, strength = _left(lit, shadows, found)
-        bright = max(float(lit.gains(changes, -left).max()) for changes in (own, *elsewhere))
-        ratios = []
-        for k, s in zip(found, strength):
-            without, _ = _left(lit, shadows, [o for o in found if o != k])
-            there = lit.only(np.abs(own[:, k]) * s > TOLD * lit.noise)
-            explained = float(there.gains(own[:, [k]], without)[0])
-            rivals = max(float(there.gains(changes, without).max()) for changes in elsewhere)
-            gain = float(lit.gains(own[:, [k]], without)[0])
-            ratios.append(min(gain / max(bright, 1e-12), explained / max(rivals, 1e-12)))
-        ratio = min(ratios)
-        if ratio >= EARNS:
-            break
-        found.pop(int(np.argmin(ratios)))
-    return found, ratio
-
-
-def _left(lit: Lit, shadows: np.ndarray, found: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """The differences that these candidates do not explain [K], and their strengths."""
-    strength, besides, _ = lit.fit(shadows[:, found])
-    return lit.residual(shadows[:, found] @ strength, besides), strength
-
-
-def _settled(
-    lights: list[Light], occluder: Occluder, grounds: Sequence[Ground], receivers: Sequence[_Receiver], ratio: float
-) -> Shadow:
-    """Directions, softness, strength and tint, precisely: a pattern search on finer charts."""
-    lit = Lit.make([r.surface for r in receivers], LEVELS)
-
-    def cast(light: Light) -> np.ndarray:
-        return np.concatenate([_cast(occluder, r.points, r.normal, light) for r in receivers])
-
-    count = len(lights)
-    lights = [*lights, Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))]
-    shadows = np.stack([cast(light) for light in lights], 1)
-    step = COARSEST
-    while step >= FINEST:
-        moved = False
-        strength, besides, _ = lit.fit(shadows)
-        for k in range(count):
-            others = np.delete(shadows, k, axis=1) @ np.delete(strength, k)
-            tries = [lights[k], *_near(lights[k], step)]
-            casts = np.stack([cast(t) for t in tries], 1).astype(np.float32)
-            best = int(lit.gains(lit.changes(casts), lit.residual(others, besides)).argmax())
-            moved |= best > 0
-            lights[k], shadows[:, k] = tries[best], casts[:, best]
-        if not moved:
-            step /= 2
-    broad = Lit.make([r.surface for r in receivers], BROAD, bent=False)
-    strength, besides, _ = broad.fit(shadows)
-    tints = broad.tints(shadows, strength)
-    explained = broad.explained(shadows @ strength, besides)
-    lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
-    words = ", ".join(
-        f"{light.strength.mean():.0%} of the light comes from {light.elevation:.0f}° above the surface"
-        f" (soft by {light.softness:.0f}°)"
-        for light in lights[:count]
-    )
-    words += f", {lights[count].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
-    fine = [g.points(FINER) for g in grounds]
-    taken = tuple(
-        _taken(occluder, lights, p.reshape(-1, 3), g.plane.normal).reshape(p.shape).astype(np.float32)
-        for g, p in zip(grounds, fine)
-    )
-    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, 1 - 1 / ratio, words)
+        strength, besides, _ = lit.fit(shadows[:, found])
+        residual = lit.residual(shadows[:, found] @ strength, besides)
+        found.append(int(lit.gains(own, residual).argmax()))
+    lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
+    settled = False
+    while True:
+        told = stage.told(lights, bright)
+        worst = min(range(len(lights)), key=lambda k: told[k].enough if settled else told[k].over_chance)
+        if told[worst].enough >= 1 if settled else told[worst].over_chance >= 1:
+            if settled:
+                return lights, told[worst]
+            lights, settled = stage.settled(lights, [], COARSEST / 2), True
+            continue
+        if len(lights) == 1:
+            return [], told[0]
+        lights.pop(worst)
+        if settled:
+            lights = stage.settled(lights, [], COARSEST / 2)
 
 
 def _near(light: Light, step: float) -> list[Light]:
@@ -450,27 +499,27 @@ def _hemisphere(count: int) -> np.ndarray:
 
 def look_at(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Ground]:
     """What photos show of the planes round the object, where they show enough."""
-    diagonal = extent(region)
-    found = []
-    for plane in planes:
-        side = 2 * REACH * diagonal
-        camera, away = facing_camera(plane, plane.origin, np.full(2, side), diagonal / DENSITY)
-        points = camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), away))
-        softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
-        said = ask(softened, points.reshape(-1, 3), ROUGH).reshape(-1, camera.height, camera.width)
-        image, spread = mosaic(points, plane.normal, softened, said)
-        photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
-        known = shown_there(said) & (photos > 1)
-        known &= spread < VIEWED * usual_spread(spread[known])
-        hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
-        hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
-        known &= ~hole
-        for other in planes:
-            if abs(other.normal @ plane.normal) <= PARALLEL:
-                known &= other.local(points.reshape(-1, 3))[:, 2].reshape(known.shape) > 0
-        if known.sum() >= FEWEST:
-            found.append(Ground(plane, camera, image, known, hole))
-    return found
+    looked = (_look_at(plane, planes, witnesses, extent(region)) for plane in planes)
+    return [ground for ground in looked if ground.known.sum() >= FEWEST]
+
+
+def _look_at(plane: Plane, planes: Sequence[Plane], witnesses: Sequence[Witness], diagonal: float) -> Ground:
+    texel = diagonal / DENSITY
+    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
+    points = camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), away))
+    softened = parallel_map(lambda w: _softened(w, plane.origin, texel), witnesses)
+    said = ask(softened, points.reshape(-1, 3), ROUGH).reshape(-1, camera.height, camera.width)
+    image, spread = mosaic(points, plane.normal, softened, said)
+    photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
+    known = shown_there(said) & (photos > 1)
+    known &= spread < VIEWED * usual_spread(spread[known])
+    hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
+    hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
+    known &= ~hole
+    for other in planes:
+        if abs(other.normal @ plane.normal) <= PARALLEL:
+            known &= other.local(points.reshape(-1, 3))[:, 2].reshape(known.shape) > 0
+    return Ground(plane, camera, image, known, hole)
 
 
 def _softened(witness: Witness, place: np.ndarray, texel: float) -> Witness:
