@@ -524,9 +524,9 @@ def _light(
     def find() -> Found:
         if settings.shadow == "mask":
             given = [shadow_masks.get(v.camera.id) for v in masks.views]
-            shadow = marked_shadow(given, surfaces.planes, witnesses, region)
+            shadow = marked_shadow(given, surfaces.planes, masks.views, witnesses, region)
         else:
-            shadow = find_shadow(scene.take(masks.removed), surfaces.planes, witnesses, region)
+            shadow = find_shadow(scene.take(masks.removed), surfaces.planes, masks.views, witnesses, region)
         return Found(None, 0.0, shadow) if isinstance(shadow, str) else Found(shadow, shadow.confidence, shadow.reason)
 
     found: Found = run("light", find)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -385,7 +386,7 @@ def _chart(
     if placed is None:
         return None
     camera, away = placed
-    surface = _surface(camera, away, plane, region, views, witnesses, textures, settings)
+    surface = surface_at(camera, away, plane, region, views, witnesses, textures, settings)
     scatter = _scatter(surface.texels, others, witnesses, settings)
     tolerance = max(settings.tolerance, scatter)
     shown = _shown(surface.points, plane, witnesses, tolerance)
@@ -477,7 +478,7 @@ def _pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks
     return 1 / math.sqrt(float(np.percentile(density, 90))) if density else math.inf
 
 
-def _surface(
+def surface_at(
     camera: Camera,
     away: float,  # z of the plane
     plane: Plane,
@@ -698,8 +699,19 @@ class Hits:
     cols: np.ndarray
 
 
+class Facing(Protocol):
+    """A surface seen straight on, as rays meet it; see Chart."""
+
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def depth(self) -> np.ndarray: ...
+    @property
+    def there(self) -> np.ndarray: ...
+
+
 def first_hits(
-    charts: Sequence[Chart],
+    charts: Sequence[Facing],
     camera: Camera,
     pixels: np.ndarray,  # [H, W] bool, the rays that are asked for
 ) -> Hits:

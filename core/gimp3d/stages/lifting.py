@@ -11,6 +11,7 @@ import numpy as np
 from ..gaussians import SH_C0, Gaussians
 from ..raster import PixelRegion, label_weights, pixel_region
 from ..threads import parallel_map
+from .charts import Hits, first_hits
 from .seed import missing_colours
 from .shadow import Ground, Shadow, linear
 from .witness import Witness
@@ -84,13 +85,9 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     depths are rough. What is drawn before it, and looks otherwise, stands on it.
     """
     camera, depth = witness.camera, witness.depth
-    rays = camera.unproject(camera.pixel_centres(), np.ones(depth.shape)) - camera.centre
-    z, on = depth.astype(np.float64), np.full(depth.shape, -1)
-    for number, ground in enumerate(shadow.grounds):
-        there, is_it = _shows(witness, ground, rays)
-        nearer = is_it & ((on < 0) | (there < z))
-        z, on = np.where(nearer, there, z), np.where(nearer, number, on)
-    points = camera.centre + z[..., None] * rays
+    hits = first_hits(shadow.grounds, camera, depth > 0)
+    on = np.where(_shows(witness, shadow.grounds, hits), hits.chart, -1).astype(int)
+    points = camera.unproject(camera.pixel_centres(), np.where(on >= 0, hits.depth, depth).astype(np.float64))
     out = np.ones((*depth.shape, 3), np.float32)
 
     def ask(rows: np.ndarray, cols: np.ndarray) -> None:
@@ -121,22 +118,20 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     return out
 
 
-def _shows(witness: Witness, ground: Ground, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W] each: z where rays meet a ground, and whether it is what the photo shows there."""
-    camera, plane = witness.camera, ground.plane
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = ((plane.origin - camera.centre) @ plane.normal) / (rays @ plane.normal)
-    z = np.where(np.isfinite(z) & (z > 0), z, 0.0)
-    uv, _ = ground.camera.project(camera.centre + z[..., None] * rays)
-    x, y = (np.nan_to_num(uv, nan=-9.0).astype(np.float32) - 0.5).transpose(2, 0, 1)
-    known, hole = (cv2.remap(m.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0 for m in (ground.known, ground.hole))
-    expected = cv2.remap(ground.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
+def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarray:
+    """[H, W] bool: the photo shows the ground that its rays meet."""
+    known, hole = np.zeros((2, *hits.chart.shape), bool)
+    expected = np.zeros_like(witness.photo)
+    for number, ground in enumerate(grounds):
+        on = hits.chart == number
+        at = hits.rows[on], hits.cols[on]
+        known[on], hole[on], expected[on] = ground.known[at], ground.hole[at], ground.image[at]
     weight = known.astype(np.float32)
-    off = np.abs(expected - witness.photo).max(-1) * weight
+    off = cv2.absdiff(expected, witness.photo).max(-1) * weight
     off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)
-    same = witness.depth > (1 - SAME) * z
-    is_it = np.where(known, off < ALIKE, same | hole).astype(np.uint8)
-    return z, (z > 0) & (cv2.medianBlur(is_it, PATCH) > 0)  # highlights are specks
+    before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
+    is_it = np.where(known, off < ALIKE, hole | ~before) & (hits.depth > 0)
+    return cv2.medianBlur(is_it.astype(np.uint8), PATCH) > 0  # highlights are specks
 
 
 def _brighter(

@@ -16,10 +16,11 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..solvers.lights import Lit, Surface
 from ..threads import parallel_map
-from .charts import PARALLEL, Plane, extent, facing_camera, shown_there, usual_spread
+from .charts import PARALLEL, ChartSettings, Plane, extent, facing_camera, shown_there, surface_at, usual_spread
+from .masks import ViewMasks
 from .mosaic import mosaic
 from .occluder import Occluder
-from .witness import Says, Witness, ask
+from .witness import Says, Textures, Witness, ask
 
 FINER = 2  # times as many along a side, in which it is stored
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
@@ -88,10 +89,12 @@ class Light:
 
 @dataclass(frozen=True)
 class Ground:
-    """What photos show of a plane round the object, coarsely; arrays [H, W] of a camera that faces it."""
+    """What photos show of a surface round the object, coarsely; arrays [H, W] of a camera that faces it."""
 
     plane: Plane
     camera: Camera
+    depth: np.ndarray  # float32 z
+    there: np.ndarray  # bool, it is not behind another one
     image: np.ndarray  # [H, W, 3] uint8
     known: np.ndarray  # bool, several photos show it, and much the same
     hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
@@ -99,8 +102,8 @@ class Ground:
     def points(self, scale: float = 1) -> np.ndarray:
         """[h, w, 3] scene coordinates of its texels, or of smaller ones."""
         camera = self.camera.scaled(scale)
-        z = float(camera.project(self.plane.origin[None])[1][0])
-        return camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), z))
+        z = cv2.resize(self.depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        return camera.unproject(camera.pixel_centres(), z.astype(np.float64))
 
 
 @dataclass(frozen=True)
@@ -205,7 +208,8 @@ class _Receiver:
 def find_shadow(
     gone: Gaussians,  # the object
     planes: Sequence[Plane],  # of the surfaces round it, the support first
-    witnesses: Sequence[Witness],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
     region: Region,
 ) -> Shadow | str:
     """The lights whose shadows of the object explain what is dark round it; or why there is none.
@@ -220,7 +224,7 @@ def find_shadow(
     occluder = Occluder.make(gone, planes[0], extent(region))
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
-    grounds = look_at(planes, witnesses, region)
+    grounds = look_at(planes, views, witnesses, region)
     fine = [_Receiver.make(g) for g in grounds]
     receivers = [half for half in (r.halved() for r in fine) if half.surface.shown.sum() >= FEWEST]
     if not receivers:
@@ -258,6 +262,7 @@ def find_shadow(
 def marked_shadow(
     masks: Sequence[np.ndarray | None],  # [H, W] bool of the witnesses' views; None where the user marked none
     planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     region: Region,
 ) -> Shadow | str:
@@ -265,7 +270,7 @@ def marked_shadow(
 
     Its edge is as soft as photos show it: shapes of several softnesses share the strength.
     """
-    grounds = look_at(planes, witnesses, region)
+    grounds = look_at(planes, views, witnesses, region)
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
     receivers = [_Receiver.make(g) for g in grounds]
@@ -497,29 +502,39 @@ def _hemisphere(count: int) -> np.ndarray:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], 1)
 
 
-def look_at(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Ground]:
-    """What photos show of the planes round the object, where they show enough."""
-    looked = (_look_at(plane, planes, witnesses, extent(region)) for plane in planes)
+def look_at(
+    planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
+) -> list[Ground]:
+    """What photos show of the surfaces round the object, where they show enough."""
+    textures = Textures.make(witnesses, shrink=LEVELS[0])
+    looked = (_look_at(plane, planes, views, witnesses, textures, region) for plane in planes)
     return [ground for ground in looked if ground.known.sum() >= FEWEST]
 
 
-def _look_at(plane: Plane, planes: Sequence[Plane], witnesses: Sequence[Witness], diagonal: float) -> Ground:
-    texel = diagonal / DENSITY
-    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
-    points = camera.unproject(camera.pixel_centres(), np.full((camera.height, camera.width), away))
-    softened = parallel_map(lambda w: _softened(w, plane.origin, texel), witnesses)
-    said = ask(softened, points.reshape(-1, 3), ROUGH).reshape(-1, camera.height, camera.width)
-    image, spread = mosaic(points, plane.normal, softened, said)
+def _look_at(
+    plane: Plane,
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    region: Region,
+) -> Ground:
+    diagonal = extent(region)
+    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), diagonal / DENSITY)
+    softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
+    surface = surface_at(camera, away, plane, region, views, witnesses, textures, ChartSettings())
+    said = ask(softened, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
+    image, spread = mosaic(surface.points, plane.normal, softened, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
-    known = shown_there(said) & (photos > 1)
+    there = np.ones(photos.shape, bool)
+    for other in planes:
+        if abs(other.normal @ plane.normal) <= PARALLEL:
+            there &= other.local(surface.texels)[:, 2].reshape(there.shape) > 0
+    known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
     hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
-    known &= ~hole
-    for other in planes:
-        if abs(other.normal @ plane.normal) <= PARALLEL:
-            known &= other.local(points.reshape(-1, 3))[:, 2].reshape(known.shape) > 0
-    return Ground(plane, camera, image, known, hole)
+    return Ground(plane, camera, surface.depth, there, image, known & ~hole, hole)
 
 
 def _softened(witness: Witness, place: np.ndarray, texel: float) -> Witness:
