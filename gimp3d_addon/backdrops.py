@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from gimp3d.errors import BadInput
 
+PAINTED = 1.5 / 255  # by which a pixel differs that was painted over
 OURS = "3D-GIMP "  # images whose names begin so are ours to replace
 
 
@@ -26,6 +28,18 @@ def load_picture(path: Path, title: str) -> bpy.types.Image:
         image.reload()
     image.pack()
     return image
+
+
+def painted_over(image: bpy.types.Image, before: str) -> np.ndarray:
+    """[H, W] bool, first row on top: where a picture differs from our image of that title, of the same size."""
+    old = bpy.data.images.get(OURS + before)
+    if old is None or tuple(old.size) != tuple(image.size):
+        raise BadInput(f"{image.name}: what was painted over is gone; paint it again")
+    new_pixels, old_pixels = (np.empty(4 * i.size[0] * i.size[1], np.float32) for i in (image, old))
+    image.pixels.foreach_get(new_pixels)
+    old.pixels.foreach_get(old_pixels)
+    off = np.abs(new_pixels - old_pixels).reshape(image.size[1], image.size[0], 4)[::-1, :, :3].max(-1)
+    return off > PAINTED
 
 
 def put_over(camera: bpy.types.Object, image: bpy.types.Image) -> None:

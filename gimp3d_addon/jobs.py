@@ -13,15 +13,18 @@ import bpy
 import numpy as np
 
 from gimp3d.camera import Camera
+from gimp3d.commands import output_name
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import write_transforms
+from gimp3d.io.images import write_png
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob, save_job, write_atomically
 
-from . import bridge, splats
+from . import backdrops, bridge, splats
 from .operators.base import current_boxes, current_splat
 from .properties import GIMP3D_preferences
 
+SHADOW_BEFORE = "shadow before"  # the view as it was before its shadow was painted over
 STATE = "blender.json"  # in a job's folder: what Blender wants back from it
 
 
@@ -109,8 +112,15 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         raise BadInput(f"the reference picture {picture} does not exist")
     if (picture or painted is not None) and not reference:
         raise BadInput("a reference picture needs its camera; choose the reference view")
+    shaded = next((camera for camera, obj in views if obj == settings.shadow_camera), None)
+    painted_shadow = settings.shadow == "mask"
+    if painted_shadow and (shaded is None or settings.shadow_paint is None):
+        raise BadInput("the shadow is to be as painted, but none is: press Paint Shadow, or choose Undo or Leave")
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
+    if painted_shadow:
+        mask = backdrops.painted_over(settings.shadow_paint, SHADOW_BEFORE)
+        write_png(folder / "shadows" / f"{output_name(shaded.id)}.png", mask)
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
     write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
@@ -134,6 +144,8 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         summary=str(folder / "summary.json"),
         seed=settings.seed,
         grow=settings.grow,
+        shadow=settings.shadow,
+        shadow_masks=str(folder / "shadows") if painted_shadow else None,
     )
     save_job(folder, job)
     return job

@@ -218,6 +218,11 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
             say(layout, f"The box cuts the object: {count:,} splats of it stay", "INFO")
             layout.operator("gimp3d.enlarge_roi", icon="FULLSCREEN_ENTER")
         layout.prop(settings, "grow")
+        layout.prop(settings, "shadow")
+        if settings.shadow == "mask":
+            layout.operator("gimp3d.paint_shadow", icon="BRUSH_DATA")
+        if settings.shadow_found:
+            say(layout, settings.shadow_found, "LIGHT_SUN")
         row = layout.row(align=True)
         row.enabled = missing is None
         row.operator("gimp3d.preview_masks", icon="MOD_MASK")

@@ -26,6 +26,11 @@ VIEWS = (
     ("COLLECTION", "Collection", "The cameras in one collection are the views"),
     ("ANIMATED", "Animated camera", "Every frame of the active camera is a view"),
 )
+SHADOWS = (
+    ("auto", "Undo", "The object's shadow is found by the light that casts it, and undone"),
+    ("off", "Leave", "Shadows stay as they are"),
+    ("mask", "As painted", "The shadow is where it was painted (Paint Shadow)"),
+)
 INPAINT = ("exemplar", "shiftmap", "fsr", "telea", "ns")
 SURFACES = ("auto", "harmonic", "planar")
 
@@ -70,6 +75,14 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         default=False,
         description="Also remove what the box cut off of the object",
     )
+    shadow: EnumProperty(
+        items=SHADOWS, name="Shadow", default="auto", description="What becomes of the object's shadow"
+    )
+    shadow_paint: PointerProperty(
+        type=bpy.types.Image, name="Painted shadow", description="A view with its shadow painted over, in any colour"
+    )
+    shadow_camera: PointerProperty(type=bpy.types.Object, name="Camera", description="The view of the painted shadow")
+    shadow_found: StringProperty(name="Light", description="The shadow that the last preview or removal found")
     proposed: StringProperty(
         name="Proposed", description="What the box cut off, as the last preview or removal found it (JSON)"
     )

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))  # light_scenes.py
 
 from property_tests import register_profiles
 from scenes import REGION, cameras, scene

@@ -5,6 +5,8 @@ A failure is one line to the user, CANCELLED to the caller (a RuntimeError in sc
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
 
 from gimp3d.errors import BadInput, Gimp3dError
@@ -202,3 +204,11 @@ def python_of(context: bpy.types.Context) -> str:
 
 
 CLASSES = (GIMP3D_OT_cancel,)
+
+
+def shadow_words(found: dict[str, Any]) -> str:
+    """The shadow of a summary, in few words; empty where it was not looked for."""
+    if found["found"]:
+        light = ", ".join(f"{x['elevation']:.0f}° high" for x in found["lights"])
+        return f"Shadow undone{f' (light {light})' if light else ' as painted'}: {found['gaussians']:,} splats"
+    return "" if found["reason"] == "not looked for" else "No shadow of it is found"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from pathlib import Path
@@ -18,9 +19,9 @@ from gimp3d.job import RemovalJob
 
 from .. import backdrops, bridge, charts, jobs, splats
 from ..worker import Worker
-from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, python_of
+from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, python_of, shadow_words
 
-PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior"}
+PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior", "shadow": "shadow"}
 VIEW = "view"  # ID of the one camera that is drawn
 
 
@@ -85,6 +86,7 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
         "--frames", job.reference, "--mode", mode, "--depth-prior", job.depth_prior,
         "--pictures", str(folder / "pictures"), "--progress", "json",
         *(("--images", job.images) if job.images else ()), *(("--grow",) if job.grow else ()),
+        "--shadow", job.shadow, *(("--shadow-masks", job.shadow_masks) if job.shadow_masks else ()),
     ]  # fmt: skip
     return Worker(arguments, python_of(context)), _stem(job.reference)
 
@@ -149,6 +151,7 @@ class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
         shown, pixels = mask, np.empty(4 * mask.size[0] * mask.size[1], np.float32)
         mask.pixels.foreach_get(pixels)
         context.scene.gimp3d.proposed = (folder / "pictures" / "proposed.json").read_text(encoding="utf-8")
+        context.scene.gimp3d.shadow_found = shadow_words(json.loads((folder / "pictures" / "shadow.json").read_bytes()))
         context.scene.gimp3d.hole = f"{np.count_nonzero(pixels[::4] > 0.5):,} pixels in {self._camera}"
         for kind, title in PREVIEWS.items():
             drawn = folder / "pictures" / f"{self._stem}.{kind}.png"
@@ -274,6 +277,35 @@ class GIMP3D_OT_paint_reference(RunsReference, bpy.types.Operator):
         backdrops.show_in_image_editor(context, image)
 
 
+class GIMP3D_OT_paint_shadow(RunsInPassing, bpy.types.Operator):
+    """Put the view into the image '3D-GIMP shadow paint': paint over the shadow, in any colour; Remove lifts it there"""
+
+    bl_idname = "gimp3d.paint_shadow"
+    bl_label = "Paint Shadow"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Import a splat scene first")
+        return current_splat(context) is not None
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        camera = _view(context)
+        if not bridge.is_view(context.scene, camera):
+            raise BadInput(f"camera {camera.name} is not among the views")
+        self._camera = camera.name
+        return _draw(context, camera, self.new_folder())
+
+    def collect(self, context: bpy.types.Context) -> None:
+        self.worker.result()
+        picture, settings = Path(self._folder.name, f"{VIEW}.png"), context.scene.gimp3d
+        backdrops.load_picture(picture, jobs.SHADOW_BEFORE)
+        image = backdrops.load_picture(picture, "shadow paint")
+        settings.shadow, settings.shadow_paint = "mask", image
+        settings.shadow_camera = context.scene.objects.get(self._camera)
+        backdrops.show_in_image_editor(context, image)
+
+
 class GIMP3D_OT_load_reference(ReportsErrors, bpy.types.Operator, ImportHelper):
     """Use a picture of the reference view without the object"""
 
@@ -299,4 +331,5 @@ CLASSES = (
     GIMP3D_OT_export_reference,
     GIMP3D_OT_paint_reference,
     GIMP3D_OT_load_reference,
+    GIMP3D_OT_paint_shadow,
 )

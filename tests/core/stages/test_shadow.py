@@ -1,0 +1,156 @@
+"""The object's shadow is found by the light that casts it, and only where there is one; and it is undone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from light_scenes import Lamp, LitScene, blocked, grain, make_scene, plain, rug, stain, tiles
+from scenes import BLOCK, floor_colours
+
+from gimp3d.box import Box
+from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, View, remove_object, render_bytes
+from gimp3d.stages.shadow import Light, linear
+
+SUN = Lamp(40, 110, 3)
+OWN = Box.make([0, 0, BLOCK / 2], [BLOCK] * 3)
+RED = 70  # by which the block is redder than green
+
+
+@cache
+def views(scene: LitScene) -> tuple[View, ...]:
+    return tuple(View(c, render_bytes(scene.gaussians, c)) for c in scene.cameras())
+
+
+@cache
+def made(name: str) -> LitScene:
+    return {
+        "waves": lambda: make_scene("waves", [SUN], floor_colours),
+        "grain": lambda: make_scene("grain", [Lamp(55, -40, 8)], grain),
+        "tiles": lambda: make_scene("tiles", [Lamp(30, 200, 1)], tiles),
+        "neighbour": lambda: make_scene("neighbour", [SUN], grain, neighbour=True),
+    }[name]()
+
+
+@cache
+def removed(scene: LitScene, settings: RemovalSettings = PRESETS["draft"]) -> RemovalResult:
+    return remove_object(scene.gaussians, views(scene), scene.region, settings)
+
+
+def log_luminance(picture: np.ndarray) -> np.ndarray:
+    return np.log(linear(picture).mean(-1) + 4e-3)
+
+
+def darkening(scene: LitScene, result: RemovalResult) -> tuple[float, float]:
+    """Mean log luminance less the truth's in the shadow, outside the block: before and after."""
+    before, after = [], []
+    final = scene.gaussians.take(result.keep)
+    final = final if result.added is None else final.extended(result.added)
+    for view in views(scene)[::3]:
+        true = log_luminance(render_bytes(scene.truth, view.camera))
+        block = view.image[..., 0].astype(int) - view.image[..., 1] > RED
+        dark = log_luminance(view.image) - true
+        shadow = (dark < -0.1) & (cv2.dilate(block.astype(np.uint8), np.ones((9, 9), np.uint8)) == 0)
+        before.append(dark[shadow])
+        after.append((log_luminance(render_bytes(final, view.camera)) - true)[shadow])
+    return float(np.concatenate(before).mean()), float(np.concatenate(after).mean())
+
+
+@pytest.mark.parametrize("name", ["waves", "grain", "tiles", "neighbour"])
+def test_the_light_is_found_and_its_shadow_goes(name: str) -> None:
+    scene = made(name)
+    result = removed(scene)
+    assert result.shadow["found"], result.shadow["reason"]
+    off = [
+        np.degrees(np.arccos(np.dot(light["direction"], scene.lamps[0].direction))) for light in result.shadow["lights"]
+    ]
+    assert len(off) == 1 and off[0] < 10, result.shadow
+    assert abs(result.shadow["lights"][0]["elevation"] - scene.lamps[0].elevation) < 10
+    assert abs((result.shadow["lights"][0]["azimuth"] - scene.lamps[0].azimuth + 180) % 360 - 180) < 14
+    before, after = darkening(scene, result)
+    assert before < -0.3 and abs(after) < 0.25 * abs(before)
+
+
+@pytest.mark.parametrize("paint", [plain, floor_colours, rug, stain])
+def test_where_the_object_casts_none_no_shadow_is_found(paint) -> None:  # type: ignore[no-untyped-def]
+    scene = make_scene(paint.__name__, [], paint, casts=False)
+    result = removed(scene)
+    assert not result.shadow["found"] and "no shadow found" in result.shadow["reason"]
+    off = remove_object(scene.gaussians, views(scene), scene.region, _off(PRESETS["draft"]))
+    np.testing.assert_array_equal(result.keep, off.keep)
+
+
+def test_a_neighbours_shadow_stays() -> None:
+    scene = make_scene("neighbour alone", [SUN], grain, neighbour=True, casts=False)
+    result = removed(scene)
+    assert not result.shadow["found"]
+
+
+def test_what_changed_is_removed_and_added_and_the_rest_is_byte_for_byte_the_same() -> None:
+    scene = made("waves")
+    with_, without = removed(scene), removed(scene, _off(PRESETS["draft"]))
+    lifted = without.keep & ~with_.keep
+    assert lifted.sum() == pytest.approx(with_.shadow["gaussians"], abs=5)
+    assert with_.added is not None
+    brighter, before = with_.added.take(np.arange(int(lifted.sum()))), scene.gaussians.take(lifted)
+    np.testing.assert_array_equal(brighter.means, before.means)
+    np.testing.assert_array_equal(brighter.quats, before.quats)
+    assert (brighter.sh[:, 0].mean(-1) >= before.sh[:, 0].mean(-1) - 0.05).mean() > 0.95
+    share = blocked(before.means.astype(float), SUN.rays(), OWN)
+    assert (share > 0.02).mean() > 0.6, "what is not in its shadow is left alone, by and large"
+
+
+def test_pictures_show_photo_light_and_lifted_photo() -> None:
+    pictures = [p for p in removed(made("waves")).pictures if p.kind == "shadow"]
+    assert len(pictures) == 2
+    light, lifted = pictures[0].data
+    assert light.min() < 200 < 250 < light.max()
+    changed = (lifted != pictures[0].image).any(-1)
+    assert (lifted[changed].astype(int) - pictures[0].image[changed] >= 0).mean() > 0.95
+
+
+def test_a_marked_shadow_is_lifted_without_a_search() -> None:
+    scene = made("tiles")
+    masks = {}
+    for view in views(scene)[::2]:  # the others abstain
+        true = render_bytes(scene.truth, view.camera)
+        masks[view.camera.id] = log_luminance(view.image) - log_luminance(true) < -0.15
+    settings = RemovalSettings(extra_references=1, shadow="mask")
+    result = remove_object(scene.gaussians, views(scene), scene.region, settings, shadow_masks=masks)
+    assert result.shadow["found"] and not result.shadow["lights"]
+    before, after = darkening(scene, result)
+    assert abs(after) < 0.5 * abs(before)
+
+
+def test_marks_on_what_is_not_dark_change_nothing() -> None:
+    scene = make_scene("plain", [], plain, casts=False)
+    masks = {}
+    for view in views(scene):
+        uv, _ = view.camera.project(np.array([[0.6, 0.4, 0.0]]))
+        masks[view.camera.id] = cv2.circle(
+            np.zeros(view.image.shape[:2], np.uint8), tuple(uv[0].astype(int).tolist()), 15, 1, -1
+        ) > 0  # fmt: skip
+    settings = RemovalSettings(extra_references=1, shadow="mask")
+    result = remove_object(scene.gaussians, views(scene), scene.region, settings, shadow_masks=masks)
+    assert not result.shadow["found"]
+    assert any("not darker" in w for w in result.warnings)
+
+
+def test_the_papers_preset_has_none_of_it() -> None:
+    assert PRESETS["paper"].shadow == PRESETS["paper-literal"].shadow == "off"
+    assert PRESETS["draft"].shadow == PRESETS["balanced"].shadow == PRESETS["best"].shadow == "auto"
+
+
+def test_rays_of_a_light_spread_as_its_softness_says() -> None:
+    light = Light(np.array([0.0, 0.6, 0.8]), 6.0, np.ones(3))
+    rays = light.rays(400)
+    apart = np.degrees(np.arccos(rays @ light.towards))
+    assert np.sqrt((apart**2).mean() / 2) == pytest.approx(6.0, rel=0.15)
+    np.testing.assert_allclose(rays.mean(0) / np.linalg.norm(rays.mean(0)), light.towards, atol=0.02)
+
+
+def _off(settings: RemovalSettings) -> RemovalSettings:
+    return replace(settings, shadow="off")
