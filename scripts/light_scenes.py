@@ -50,7 +50,7 @@ class Lamp:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # a scene is itself
 class LitScene:
     """A scene with the object and its shadow, and what it is without."""
 

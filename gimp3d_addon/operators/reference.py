@@ -278,7 +278,7 @@ class GIMP3D_OT_paint_reference(RunsReference, bpy.types.Operator):
 
 
 class GIMP3D_OT_paint_shadow(RunsInPassing, bpy.types.Operator):
-    """Put the view into the image '3D-GIMP shadow paint': paint over the shadow, in any colour; Remove lifts it there"""
+    """Put the view into the image '3D-GIMP shadow paint': paint over the shadow, in any colour, and it is undone"""
 
     bl_idname = "gimp3d.paint_shadow"
     bl_label = "Paint Shadow"

@@ -106,3 +106,29 @@ def test_the_providers_that_are_offered_are_those_that_there_are() -> None:
 def test_every_provider_that_is_offered_exists(splat: bpy.types.Object, provider: str) -> None:
     bpy.context.scene.gimp3d.inpaint, bpy.context.scene.gimp3d.preset = provider, "draft"
     assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+
+
+def test_a_shadow_painted_over_is_the_removals_shadow(splat: bpy.types.Object, tmp_path: Path) -> None:
+    settings = bpy.context.scene.gimp3d
+    assert bpy.ops.gimp3d.paint_shadow() == {"FINISHED"}
+    assert settings.shadow == "mask" and settings.shadow_camera.name == "orbit/002"
+    image = settings.shadow_paint
+    pixels = np.array(image.pixels).reshape(90, 120, 4)
+    pixels[10:20, 30:50, :3] = GREEN[1] / 255
+    image.pixels.foreach_set(pixels.astype(np.float32).ravel())
+    image.update()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
+    assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
+    job = load_job(next((tmp_path / "gimp3d_jobs").iterdir()))
+    assert job.shadow == "mask"
+    mask = read_image(next(Path(job.shadow_masks).rglob("*.png")))[..., 0] > 127
+    assert mask[70:80, 30:50].mean() > 0.95 and mask.sum() < 1.1 * 200  # Blender counts rows from below
+
+
+def test_a_shadow_that_was_never_painted_is_asked_for(splat: bpy.types.Object) -> None:
+    bpy.context.scene.gimp3d.shadow = "mask"
+    with pytest.raises(RuntimeError, match="Paint Shadow"):
+        bpy.ops.gimp3d.remove_object()
+    bpy.context.scene.gimp3d.shadow = "off"
+    assert bpy.ops.gimp3d.preview_masks() == {"FINISHED"}
+    assert bpy.context.scene.gimp3d.shadow_found == ""

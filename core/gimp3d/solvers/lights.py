@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sparse
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
 LEAST_NOISE = 0.01  # of log luminance
 CHROMA = 3.0  # times the usual difference of colour, from which an edge is hardly one of light
 DARKEST = 0.95  # share of light that shadows may take together
 ROUNDS = 6  # of reweighting
-STEPS = 60  # of L-BFGS
+STEPS, HALVINGS, ENOUGH = 20, 6, 1e-5  # of a fit, and the share of the loss by which another one must help
 NORMAL = 0.265  # mean of √(1 + u²) − 1 for normal u
 TINTS, TINTLESS = (0.7, 1.3), 40.0  # by which channels' strengths may differ, and how far that is held at 1
 SPREAD = 3.0  # standard deviations of colour beyond which more does not tell more
@@ -71,7 +71,7 @@ class Lit:
         colourful = np.abs(hues).max(1)
         weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
         scaled = np.linalg.qr(other * (np.sqrt(weight) / noise)[:, None], mode="r")
-        other = scipy.linalg.solve_triangular(scaled + 1e-6 * np.eye(len(scaled)), other.T, trans="T").T  # for L-BFGS
+        other = scipy.linalg.solve_triangular(scaled + 1e-6 * np.eye(len(scaled)), other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
     def fit(self, shadows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -79,37 +79,45 @@ class Lit:
 
         Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
-        count = shadows.shape[1]
-        changes = self.operator @ shadows.astype(np.float64)
-        scale = 1 / (np.sqrt(self.weight @ (changes / self.noise[:, None]) ** 2) + 1e-9)  # all are as steep, about
-        shadows = shadows * scale
-
-        def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
-            taken = shadows @ x[:count]
-            left = 1 - np.minimum(taken, DARKEST)
-            u = (self.observed - self.operator @ np.log(left) - self.besides @ x[count:]) / self.noise
-            root = np.sqrt(1 + u * u)
-            slope = self.weight * u / root / self.noise
-            at = (self.operator.T @ slope) / left * (taken < DARKEST)
-            return float((self.weight * (root - 1)).sum()), np.concatenate([shadows.T @ at, -self.besides.T @ slope])
-
-        bounds = [(0, 1 / s) for s in scale] + [(None, None)] * self.besides.shape[1]
-        start = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
-        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
-        return found.x[:count] * scale, found.x[count:], float(found.fun)
+        count, shadows = shadows.shape[1], shadows.astype(np.float64)
+        x = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
+        least = np.concatenate([np.zeros(count), np.full(len(x) - count, -np.inf)])
+        most = np.where(least == 0, 1.0, np.inf)
+        loss = self.loss(self.residual(shadows @ x[:count], x[count:]))
+        for _ in range(STEPS):  # Gauss and Newton's, reweighted; bounded, and halved until it helps
+            residual = self.residual(shadows @ x[:count], x[count:])
+            curve = self.weight / np.sqrt(1 + (residual / self.noise) ** 2) / self.noise**2
+            steep = _log_lit(shadows @ x[:count])[1]
+            slopes = np.concatenate([self.operator @ (-steep[:, None] * shadows), self.besides], axis=1)
+            scaled = slopes * curve[:, None]
+            bends = scaled.T @ slopes
+            root = np.linalg.cholesky(bends + 1e-9 * np.trace(bends) * np.eye(len(x)))
+            aim = scipy.linalg.solve_triangular(root, scaled.T @ residual, lower=True)
+            step = lsq_linear(root.T, aim, (least - x, most - x + 1e-12)).x
+            for _ in range(HALVINGS):
+                tried = x + step
+                after = self.loss(self.residual(shadows @ tried[:count], tried[count:]))
+                if after < loss:
+                    break
+                step = step / 2
+            gained = loss - after
+            if gained > 0:
+                x, loss = np.clip(tried, least, most), after
+            if gained <= ENOUGH * loss:
+                break
+        return x[:count], x[count:], loss
 
     def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """[S, 3] by what strengths [S] of shadows [T, S] differ between the channels: their mean is about 1."""
-        dark = np.minimum(shadows @ strengths, DARKEST)
-        grey = self.operator @ np.log(1 - dark)
+        grey = self.operator @ _log_lit(shadows @ strengths)[0]
         noise = self.hues.std(0) + LEAST_NOISE
         scaled = shadows.astype(np.float64) * strengths
 
         def loss(x: np.ndarray, channel: int) -> tuple[float, np.ndarray]:
-            left = 1 - np.minimum(scaled @ x, DARKEST)
-            u = (self.hues[:, channel] + grey - self.operator @ np.log(left)) / noise[channel]
+            lit, steep = _log_lit(scaled @ x)
+            u = (self.hues[:, channel] + grey - self.operator @ lit) / noise[channel]
             root = np.sqrt(1 + u * u)
-            slope = scaled.T @ ((self.operator.T @ (u / root / noise[channel])) / left)
+            slope = scaled.T @ ((self.operator.T @ (u / root / noise[channel])) * steep)
             held = TINTLESS * (x - 1)
             return float((root - 1).sum() + 0.5 * held @ (x - 1)), slope + held
 
@@ -128,12 +136,11 @@ class Lit:
 
     def residual(self, darkness: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         """[K] what is left of the differences; `darkness` [T] is the share of light that shadows take."""
-        lit = np.log(1 - np.minimum(darkness, DARKEST))
-        return self.observed - self.operator @ lit - self.besides @ coefficients
+        return self.observed - self.operator @ _log_lit(darkness)[0] - self.besides @ coefficients
 
     def explained(self, darkness: np.ndarray, coefficients: np.ndarray) -> float:
         """Share of the squared differences that the darkness explains, where it makes any."""
-        made = self.operator @ np.log(1 - np.minimum(darkness, DARKEST))
+        made = self.operator @ _log_lit(darkness)[0]
         there = np.abs(made) > LEAST_NOISE
         before = self.observed - self.besides @ coefficients
         squares = [(self.weight * there * d**2).sum() for d in (before - made, before)]
@@ -155,6 +162,12 @@ class Lit:
         bend = np.einsum("ks,ks,k->s", changes, changes, curve.astype(np.float32)) + 1e-9
         strength = np.clip(down / bend, 0, 1)
         return strength * down - 0.5 * strength**2 * bend
+
+
+def _log_lit(darkness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """log(1 − d), and by how much it falls with d, [T] each; past DARKEST a straight line, or no line search ends."""
+    left = 1 - np.minimum(darkness, DARKEST)
+    return np.log(left) - np.maximum(darkness - DARKEST, 0) / left, 1 / left
 
 
 def _differences(shown: np.ndarray, levels: Sequence[int]) -> tuple[sparse.csr_matrix, np.ndarray]:

@@ -23,6 +23,7 @@ DARKEST = 0.15  # share of light below which a photo holds too little texture to
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 SAME = 0.05  # relative z up to which what is drawn nearer than an unknown ground is still that ground
+MIXED = 0.75  # the same right beside the object, whose own colours, in the same pixels, would be lifted too
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
 LOOKS = 12  # views by which colours are corrected
 CORRECTIONS = 3  # steps
@@ -62,7 +63,8 @@ def lift_shadow(
 
     def lifted(witness: Witness, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shaded = (light.min(-1) < UNTOUCHED) & ~witness.hidden
-        dark = shaded & (light.mean(-1) < DARKEST)
+        mixed = cv2.dilate((witness.hidden | witness.beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        dark = shaded & (light.mean(-1) < np.where(mixed, MIXED, DARKEST))
         bright = encoded(linear(witness.photo[shaded]) / np.maximum(light[shaded], DARKEST))
         photo = witness.photo.copy()
         photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)

@@ -36,7 +36,7 @@ def test_the_shadow_is_that_of_the_shape(elevation: float) -> None:
     found, true = occluder().blocked(points, in_plane(rays)).mean(1), blocked(points, rays, BOX)
     assert true.max() == 1.0
     assert np.abs(found - true).mean() < 0.01
-    assert np.corrcoef(found, true)[0, 1] > 0.97
+    assert np.corrcoef(found, true)[0, 1] > 0.95  # the shadow of 70° is four cells wide
 
 
 def test_no_light_goes_below_what_stands() -> None:
