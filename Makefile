@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real extension \
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real bench-light extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -67,6 +67,9 @@ bench-references: $(READY)
 # every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
 bench-real: $(READY)
 	$(BIN)/python scripts/bench_real.py $(DATA)
+
+bench-light: $(READY)
+	$(BIN)/python scripts/bench_light.py $(DATA)
 
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)

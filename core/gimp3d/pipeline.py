@@ -468,7 +468,8 @@ class Lit:
         changed &= result.keep  # some were taken away since
         brighter = self.lifted.scene(scene).take(changed)
         added = brighter if result.added is None else brighter.extended(result.added)
-        return replace(result, keep=result.keep & ~changed, added=added, shadow=self.shadow)
+        shadow = {**self.shadow, "gaussians": int(changed.sum())}
+        return replace(result, keep=result.keep & ~changed, added=added, shadow=shadow)
 
 
 NOT_LIT = Lit(None, {"found": False, "lights": [], "explained": 0.0, "reason": "not looked for"})
