@@ -42,6 +42,18 @@ def painted_over(image: bpy.types.Image, before: str) -> np.ndarray:
     return off > PAINTED
 
 
+def save_mask(mask: np.ndarray, path: Path) -> None:
+    """Write [H, W] bool, first row on top, as a black and white PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = bpy.data.images.new(OURS + "mask to save", mask.shape[1], mask.shape[0])
+    pixels = np.repeat(mask[::-1, :, None].astype(np.float32), 4, axis=2)
+    pixels[..., 3] = 1.0
+    image.pixels.foreach_set(pixels.ravel())
+    image.filepath_raw, image.file_format = str(path), "PNG"
+    image.save()
+    bpy.data.images.remove(image)
+
+
 def put_over(camera: bpy.types.Object, image: bpy.types.Image) -> None:
     """Show a picture in front of what the camera sees, in place of our last one."""
     take_away(camera)

@@ -12,11 +12,9 @@ from typing import Any
 import bpy
 import numpy as np
 
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name
+from gimp3d.camera import Camera, output_name
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import write_transforms
-from gimp3d.io.images import write_png
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob, save_job, write_atomically
 
@@ -120,7 +118,7 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     folder.mkdir(parents=True, exist_ok=True)
     if painted_shadow:
         mask = backdrops.painted_over(settings.shadow_paint, SHADOW_BEFORE)
-        write_png(folder / "shadows" / f"{output_name(shaded.id)}.png", mask)
+        backdrops.save_mask(mask, folder / "shadows" / f"{output_name(shaded.id)}.png")
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
     write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))

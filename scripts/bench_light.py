@@ -28,15 +28,15 @@ from pages import sheet, titled
 from real_scenes import Scene, read_scene
 
 from gimp3d.box import Region, read_region
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name, render_views
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import render_views
 from gimp3d.evaluate.benchmark import photo_with_object
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.formats import read_scene as read_splat
 from gimp3d.io.images import load_view, read_image, write_png
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
-from gimp3d.stages.shadow import linear
+from gimp3d.srgb import linear
 
 SHADOWED = ("tiles_mug", "kitchen_monkey", "desk_shadow", "corner_shadow")
 CLEAR = ("desk", "corner", "gloss", "rocks", "real_table")

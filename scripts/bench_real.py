@@ -31,8 +31,8 @@ from real_scenes import (
     round_the_object,
 )
 
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name, render_views
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import render_views
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.benchmark import empty_region, photo_with_object, score_renders, telea
 from gimp3d.evaluate.metrics import psnr

@@ -21,7 +21,7 @@ from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
-from gimp3d.stages.lifting import encoded
+from gimp3d.srgb import decoded, encoded
 
 STEP = 0.025  # between splats
 RAYS = 64  # to a soft light
@@ -85,8 +85,7 @@ def lit(ground: Gaussians, normal: np.ndarray, lamps: Sequence[Lamp], boxes: Seq
         if len(rays):
             share -= lamp.strength * np.max([blocked(points, rays, box) for box in boxes], axis=0)
     colours = np.clip(0.5 + SH_C0 * ground.sh[:, 0].astype(np.float64), 0.0, 1.0)
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    sh = (encoded(linear * share[:, None]) - 0.5) / SH_C0
+    sh = (encoded(decoded(colours) * share[:, None]) - 0.5) / SH_C0
     return replace(ground, sh=sh[:, None].astype(np.float32))
 
 

@@ -17,8 +17,8 @@ from propagate_cost import Size, room
 
 from gimp3d import pipeline
 from gimp3d.box import read_region
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name, select_cameras
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import select_cameras
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.metrics import flip_map, psnr, ssim_map
 from gimp3d.gaussians import Gaussians

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name, select_cameras
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import select_cameras
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.io.cameras import read_cameras

@@ -11,7 +11,7 @@ import numpy as np
 from chart import FAINT, INK, Axis, Series, drawn, frame, group_colours, mark, page, text
 from surface_scenes import SHADOW
 
-from gimp3d.commands import output_name
+from gimp3d.camera import output_name
 
 TOP, PLOT_HEIGHT, BETWEEN = 100, 150, 62  # px
 BESIDE, WITH_TICKS = 26, 84  # px left of a panel whose axis is its neighbour's, and of one with its own

@@ -9,8 +9,7 @@ import numpy as np
 from pages import fitted, sheet, titled
 from surface_scenes import Scene, completed, depth_errors, surface, targets
 
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name
+from gimp3d.camera import Camera, output_name
 from gimp3d.errors import IllPosed
 from gimp3d.io.images import read_image
 from gimp3d.report import relief, tinted

@@ -13,7 +13,7 @@ from surface_chart import KINDS
 from surface_pictures import COVERED, MISSED, MORE
 from surface_scenes import SHADOW
 
-from gimp3d.commands import output_name
+from gimp3d.camera import output_name
 from gimp3d.report import STYLE
 
 LEGEND = {"never seen and in T": COVERED, "never seen and missed": MISSED, "in T though some view sees it": MORE}

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from gimp3d.box import Region, read_region
-from gimp3d.camera import Camera
-from gimp3d.commands import output_name, select_cameras
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import select_cameras
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras

@@ -108,3 +108,10 @@ class Camera:
             cx=self.cx * sx,
             cy=self.cy * sy,
         )
+
+
+def output_name(camera_id: str) -> str:
+    """A camera's ID without its extension, as a relative output path."""
+    head, _, tail = camera_id.rpartition("/")
+    stem = tail.rsplit(".", 1)[0] if "." in tail[1:] else tail
+    return f"{head}/{stem}" if head else stem

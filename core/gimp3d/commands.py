@@ -15,7 +15,7 @@ import numpy as np
 
 from . import __version__
 from .box import read_region
-from .camera import Camera
+from .camera import Camera, output_name
 from .errors import BadInput
 from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
@@ -475,13 +475,6 @@ def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str
         for mark in marks:
             digest.update(mark[view.camera.id].tobytes() if view.camera.id in mark else b"none")
     return digest.hexdigest()
-
-
-def output_name(camera_id: str) -> str:
-    """A camera's ID without its extension, as a relative output path."""
-    head, _, tail = camera_id.rpartition("/")
-    stem = tail.rsplit(".", 1)[0] if "." in tail[1:] else tail
-    return f"{head}/{stem}" if head else stem
 
 
 def to_bytes(picture: np.ndarray) -> np.ndarray:

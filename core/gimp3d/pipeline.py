@@ -26,9 +26,11 @@ from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_numbe
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
+from .stages.ground import Ground
 from .stages.growth import Growth
 from .stages.layers import LayerSettings
 from .stages.lifting import Lifted, lift_shadow
+from .stages.light_search import Light
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
 from .stages.occluder import Occluder
@@ -61,7 +63,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
-from .stages.shadow import Ground, Light, Shadow, find_shadow, marked_shadow
+from .stages.shadow import Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
 from .threads import parallel_map

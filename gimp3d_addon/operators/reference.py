@@ -12,6 +12,7 @@ import numpy as np
 from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
+from gimp3d.camera import output_name
 from gimp3d.errors import BadInput
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
@@ -88,13 +89,7 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
         *(("--images", job.images) if job.images else ()), *(("--grow",) if job.grow else ()),
         "--shadow", job.shadow, *(("--shadow-masks", job.shadow_masks) if job.shadow_masks else ()),
     ]  # fmt: skip
-    return Worker(arguments, python_of(context)), _stem(job.reference)
-
-
-def _stem(camera_id: str) -> str:
-    folder, _, tail = camera_id.rpartition("/")
-    stem = tail.rsplit(".", 1)[0] if "." in tail[1:] else tail
-    return f"{folder}/{stem}" if folder else stem
+    return Worker(arguments, python_of(context)), output_name(job.reference)
 
 
 class GIMP3D_OT_render_view(RunsInPassing, bpy.types.Operator):

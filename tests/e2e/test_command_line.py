@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
 
+from gimp3d.camera import output_name
 from gimp3d.cli import main
-from gimp3d.commands import output_name
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply, write_gaussians

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from ..box import read_region
-from ..commands import output_name, render_views, run_removal, select_cameras
+from ..camera import output_name
+from ..commands import render_views, run_removal, select_cameras
 from ..errors import BadInput
 from ..io.cameras import read_cameras
 from ..io.images import read_image, read_mask, write_png

@@ -10,10 +10,12 @@ import numpy as np
 
 from ..gaussians import SH_C0, Gaussians
 from ..raster import PixelRegion, label_weights, pixel_region
+from ..srgb import decoded, encoded, linear
 from ..threads import parallel_map
 from .charts import Hits, first_hits
+from .ground import Ground
 from .seed import missing_colours
-from .shadow import Ground, Shadow, linear
+from .shadow import Shadow
 from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
@@ -72,7 +74,8 @@ def lift_shadow(
 
     photos, shaded, dark = zip(*(lifted(w, a) for w, a in zip(witnesses, arriving)))
     rows, sh = _brighter(scene, removed, witnesses, arriving)
-    sh = _matched(scene, removed, rows, sh, witnesses, photos, shaded)
+    clear = [s & ~d & ~w.beside for s, d, w in zip(shaded, dark, witnesses)]
+    sh = _matched(scene, removed, rows, sh, witnesses, photos, clear)
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
     light = tuple(np.rint(a.mean(-1) * 255).astype(np.uint8) for a in arriving)
@@ -171,7 +174,7 @@ def _brighter(
     rows = np.flatnonzero((total > SHOWN) & (light.min(1) < UNTOUCHED))
     sh = kept.sh[rows].astype(np.float64)
     colour = np.clip(0.5 + SH_C0 * sh[:, 0], 0.02, 1.0)
-    gain = encoded(_decoded(colour) / light[rows]) / colour
+    gain = encoded(decoded(colour) / light[rows]) / colour
     sh[:, 0] = (gain * (0.5 + SH_C0 * sh[:, 0]) - 0.5) / SH_C0
     sh[:, 1:] *= gain[:, None]
     return stays[rows], sh.astype(np.float32)
@@ -184,7 +187,7 @@ def _matched(
     sh: np.ndarray,  # [M, K, 3] of these rows
     witnesses: Sequence[Witness],
     photos: Sequence[np.ndarray],
-    shaded: Sequence[np.ndarray],
+    wanted: Sequence[np.ndarray],  # [H, W] bool, where they tell
 ) -> np.ndarray:
     """The colours corrected so that the scene, drawn, shows the lifted photos: least squares (SIRT), c_0 alone."""
     if not len(rows):
@@ -192,9 +195,8 @@ def _matched(
     others = ~removed
     others[rows] = False
     rest, lit = scene.take(others), replace(scene.take(rows), sh=sh)
-    most = sorted(range(len(witnesses)), key=lambda k: -int(shaded[k].sum()))[:LOOKS]
-    wanted = [shaded[k] & ~witnesses[k].beside for k in most]
-    looks = [(k, w) for k, w in zip(most, wanted) if w.any()]
+    most = sorted(range(len(witnesses)), key=lambda k: -int(wanted[k].sum()))[:LOOKS]
+    looks = [(k, wanted[k]) for k in most if wanted[k].any()]
     regions = parallel_map(lambda p: pixel_region(rest, witnesses[p[0]].camera, p[1], passes=frozenset({"rgb"})), looks)
 
     def step(colours: Gaussians, region: PixelRegion, look: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -206,12 +208,3 @@ def _matched(
         corrected[:, 0] += sum(s[1] for s in steps) / (sum(s[0] for s in steps) + HOLD)
         lit = replace(lit, sh=corrected)
     return lit.sh
-
-
-def encoded(light: np.ndarray) -> np.ndarray:
-    """sRGB of linear light (IEC 61966-2-1)."""
-    return np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def _decoded(colour: np.ndarray) -> np.ndarray:
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)

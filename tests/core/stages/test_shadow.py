@@ -13,7 +13,8 @@ from scenes import BLOCK, floor_colours
 
 from gimp3d.box import Box
 from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, View, remove_object, render_bytes
-from gimp3d.stages.shadow import Light, linear
+from gimp3d.srgb import linear
+from gimp3d.stages.light_search import Light
 
 SUN = Lamp(40, 110, 3)
 OWN = Box.make([0, 0, BLOCK / 2], [BLOCK] * 3)

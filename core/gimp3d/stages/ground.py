@@ -1,0 +1,91 @@
+"""The surfaces round the object, seen straight on and coarsely: what its shadow may fall on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..box import Region
+from ..camera import Camera
+from ..threads import parallel_map
+from .charts import PARALLEL, ChartSettings, Plane, extent, facing_camera, shown_there, surface_at, usual_spread
+from .masks import ViewMasks
+from .mosaic import mosaic
+from .witness import Says, Textures, Witness, ask
+
+REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
+DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
+ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
+FEWEST = 50  # texels of a surface that is looked at
+BESIDE = 2  # texels beside what the object hides that may show some of it
+VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
+TEXTURED = 2  # by which pictures are shrunk whose textures tell planes from reliefs
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What photos show of a surface round the object, coarsely; arrays [H, W] of a camera that faces it."""
+
+    plane: Plane
+    camera: Camera
+    depth: np.ndarray  # float32 z
+    there: np.ndarray  # bool, it is not behind another one
+    image: np.ndarray  # [H, W, 3] uint8
+    known: np.ndarray  # bool, several photos show it, and much the same
+    hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
+
+    def points(self, scale: float = 1) -> np.ndarray:
+        """[h, w, 3] scene coordinates of its texels, or of smaller ones."""
+        camera = self.camera.scaled(scale)
+        z = cv2.resize(self.depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        return camera.unproject(camera.pixel_centres(), z.astype(np.float64))
+
+
+def look_at(
+    planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
+) -> list[Ground]:
+    """What photos show of the surfaces round the object, where they show enough."""
+    textures = Textures.make(witnesses, shrink=TEXTURED)
+    looked = (_look_at(plane, planes, views, witnesses, textures, region) for plane in planes)
+    return [ground for ground in looked if ground.known.sum() >= FEWEST]
+
+
+def _look_at(
+    plane: Plane,
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    region: Region,
+) -> Ground:
+    diagonal = extent(region)
+    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), diagonal / DENSITY)
+    softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
+    surface = surface_at(camera, away, plane, region, views, witnesses, textures, ChartSettings())
+    said = ask(softened, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
+    image, spread = mosaic(surface.points, plane.normal, softened, said)
+    photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
+    there = np.ones(photos.shape, bool)
+    for other in planes:
+        if abs(other.normal @ plane.normal) <= PARALLEL:
+            there &= other.local(surface.texels)[:, 2].reshape(there.shape) > 0
+    known = shown_there(said) & (photos > 1) & there
+    known &= spread < VIEWED * usual_spread(spread[known])
+    hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
+    hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
+    return Ground(plane, camera, surface.depth, there, image, known & ~hole, hole)
+
+
+def _softened(witness: Witness, place: np.ndarray, texel: float) -> Witness:
+    """The photo blurred to a texel's size at a place, without the object."""
+    z = float(witness.camera.project(place[None])[1][0])
+    sigma = 0.35 * texel * witness.camera.fx / z if z > 0 else 0.0
+    if sigma < 0.6:
+        return witness
+    shown = (~(witness.hidden | witness.beside)).astype(np.float32)
+    total = cv2.GaussianBlur(witness.photo * shown[..., None], (0, 0), sigma)
+    weight = cv2.GaussianBlur(shown, (0, 0), sigma)
+    return replace(witness, photo=np.clip(total / np.maximum(weight, 1e-3)[..., None], 0, 255).astype(np.uint8))
