@@ -51,9 +51,12 @@ class Shadow:
             at = uv * [taken.shape[1] / w, taken.shape[0] / h] - 0.5
             x, y = at.astype(np.float32).T[:, :, None]
             return 1 - cv2.remap(taken, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
-        if self.occluder is None:
-            return np.ones((len(points), 3))
-        return 1 - taken_from(self.occluder, self.lights, points)
+        light = np.ones((len(points), 3))
+        if self.occluder is not None:
+            uv, _ = self.grounds[0].camera.project(points)
+            near = ((uv >= 0) & (uv < self.grounds[0].known.shape[::-1])).all(1)  # no shadow is looked for elsewhere
+            light[near] -= taken_from(self.occluder, self.lights, points[near])
+        return light
 
     def facts(self) -> dict[str, Any]:
         """For the summary: lights by degrees, strengths in shares of light."""
