@@ -70,8 +70,9 @@ class Lit:
         noise = _usual(observed - other @ _explained(observed, other, group), group)
         colourful = np.abs(hues).max(1)
         weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
-        scaled = np.linalg.qr(other * (np.sqrt(weight) / noise)[:, None], mode="r")
-        other = scipy.linalg.solve_triangular(scaled + 1e-6 * np.eye(len(scaled)), other.T, trans="T").T  # orthogonal
+        scaled = other * (np.sqrt(weight) / noise)[:, None]
+        root = np.linalg.qr(np.concatenate([scaled, 1e-6 * np.eye(scaled.shape[1])]), mode="r")
+        other = scipy.linalg.solve_triangular(root, other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
     def fit(self, shadows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -91,7 +92,7 @@ class Lit:
             slopes = np.concatenate([self.operator @ (-steep[:, None] * shadows), self.besides], axis=1)
             scaled = slopes * curve[:, None]
             bends = scaled.T @ slopes
-            root = np.linalg.cholesky(bends + 1e-9 * np.trace(bends) * np.eye(len(x)))
+            root = np.linalg.cholesky(bends + (1e-9 * np.trace(bends) + 1e-12) * np.eye(len(x)))
             aim = scipy.linalg.solve_triangular(root, scaled.T @ residual, lower=True)
             step = lsq_linear(root.T, aim, (least - x, most - x + 1e-12)).x
             for _ in range(HALVINGS):
@@ -212,6 +213,8 @@ def _usual(values: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 def _explained(observed: np.ndarray, other: np.ndarray, group: np.ndarray) -> np.ndarray:
     """[B] robust least squares, each group by its own noise."""
+    if not len(observed):
+        return np.zeros(other.shape[1])
     noise, found = np.full(len(observed), max(float(np.std(observed)), LEAST_NOISE)), np.zeros(other.shape[1])
     for _ in range(ROUNDS):
         weight = 1 / np.sqrt(1 + ((observed - other @ found) / noise) ** 2) / noise**2

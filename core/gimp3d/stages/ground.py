@@ -19,7 +19,7 @@ from .witness import Says, Textures, Witness, ask
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
 DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
 ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
-FEWEST = 50  # texels of a surface that is looked at
+FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
 TEXTURED = 2  # by which pictures are shrunk whose textures tell planes from reliefs

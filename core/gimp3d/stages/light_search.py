@@ -91,12 +91,8 @@ class Receiver:
 
     @classmethod
     def make(cls, ground: Ground) -> Receiver:
-        camera = ground.camera
-        z = float(camera.project(ground.plane.origin[None])[1][0])
-        points = camera.unproject(camera.pixel_centres(), np.full(ground.known.shape, z))
-        return cls(
-            Surface(ground.known, np.log(linear(ground.image) + DARK)), points[ground.known], ground.plane.normal
-        )
+        surface = Surface(ground.known, np.log(linear(ground.image) + DARK))
+        return cls(surface, ground.points()[ground.known], ground.plane.normal)
 
     def halved(self) -> Receiver:
         """Blocks of four texels, where half of them are known."""

@@ -16,7 +16,7 @@ from ..gaussians import Gaussians
 from ..solvers.lights import Lit
 from .charts import Plane, extent
 from .ground import FEWEST, ROUGH, Ground, look_at
-from .light_search import BROAD, FAINT, FINEST, LEVELS, Light, Receiver, Stage, search, taken_from
+from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Stage, search, taken_from
 from .masks import ViewMasks
 from .occluder import Occluder
 from .witness import Says, Witness, ask
@@ -159,9 +159,8 @@ def marked_shadow(
     explained = lit.explained(shadows @ strength, besides)
     tints = strength[:, None] * lit.tints(shadows, strength)
     words = f"{strength.sum():.0%} of the light is missing where it is marked; {explained:.0%} is explained"
-    return Shadow(
-        tuple(grounds), None, (), tuple((s @ tints).astype(np.float32) for s in shapes), explained, 1.0, words
-    )
+    taken = tuple(np.minimum(s @ tints, 1 - DARK).astype(np.float32) for s in shapes)
+    return Shadow(tuple(grounds), None, (), taken, explained, 1.0, words)
 
 
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:

@@ -82,3 +82,13 @@ def test_the_candidate_that_was_cast_gains_most() -> None:
     residual = lit.residual(np.zeros(SIZE * SIZE), besides)
     assert lit.gains(lit.changes(shapes), residual).argmax() == 5
     assert lit.gains(lit.changes(shapes), -residual)[5] == 0.0  # brightness is no shadow
+
+
+@given(st.integers(0, 2**31), st.integers(1, 60))
+def test_hardly_known_surfaces_are_no_error(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    shown = np.zeros((SIZE, SIZE), bool)
+    shown.flat[rng.choice(SIZE * SIZE, count, replace=False)] = True
+    lit = Lit.make([Surface(shown, rng.normal(size=(SIZE, SIZE, 3)))], LEVELS)
+    strengths, besides, loss = lit.fit(blot(32, 32, 8)[shown][:, None])
+    assert 0 <= strengths[0] <= 1 and np.isfinite(besides).all() and np.isfinite(loss)
