@@ -426,7 +426,7 @@ def _placed(
         return None
     centre, size = part
     place = plane.points(*centre[:, None])[0]
-    texel = _pixel_size(place, plane.normal, views)
+    texel = pixel_size(place, plane.normal, views)
     if not math.isfinite(texel):
         return None
     return facing_camera(plane, place, size, max(texel, float(size.max()) / settings.largest))
@@ -467,7 +467,7 @@ def _hidden_part(
     return (low + high) / 2, size
 
 
-def _pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
+def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
     """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
     density = []
     for v in views:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,17 @@ import numpy as np
 from ..box import Region
 from ..camera import Camera
 from ..threads import parallel_map
-from .charts import PARALLEL, ChartSettings, Plane, extent, facing_camera, shown_there, surface_at, usual_spread
+from .charts import (
+    PARALLEL,
+    ChartSettings,
+    Plane,
+    extent,
+    facing_camera,
+    pixel_size,
+    shown_there,
+    surface_at,
+    usual_spread,
+)
 from .masks import ViewMasks
 from .mosaic import mosaic
 from .witness import Says, Textures, Witness, ask
@@ -20,7 +31,8 @@ REACH = 2.0  # diagonals of the region round the object in which a shadow is loo
 DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
 ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 100  # texels of a surface that is looked at
-BESIDE = 2  # texels beside what the object hides that may show some of it
+BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
+MIXED = 3.0  # … and pixels of the views that show the place best
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
 TEXTURED = 2  # by which pictures are shrunk whose textures tell planes from reliefs
 
@@ -75,7 +87,8 @@ def _look_at(
     known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
-    hole = cv2.dilate(hole, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0
+    beside = max(BESIDE, math.ceil(MIXED * pixel_size(plane.origin, plane.normal, views) * DENSITY / diagonal))
+    hole = cv2.dilate(hole, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0
     return Ground(plane, camera, surface.depth, there, image, known & ~hole, hole)
 
 

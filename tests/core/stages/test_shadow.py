@@ -75,7 +75,7 @@ def test_the_light_is_found_and_its_shadow_goes(name: str) -> None:
     assert before < -0.3 and abs(after) < 0.35 * abs(before)  # 0.32 for grain, whose light is softest
 
 
-@pytest.mark.parametrize("paint", [plain, floor_colours, rug, stain])
+@pytest.mark.parametrize("paint", [plain, floor_colours, tiles, rug, stain])
 def test_where_the_object_casts_none_no_shadow_is_found(paint) -> None:  # type: ignore[no-untyped-def]
     scene = make_scene(paint.__name__, [], paint, casts=False)
     result = removed(scene)
