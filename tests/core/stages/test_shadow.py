@@ -90,6 +90,18 @@ def test_a_neighbours_shadow_stays() -> None:
     assert not result.shadow["found"]
 
 
+def test_what_stands_before_the_shadow_keeps_its_colours() -> None:
+    scene, result = made("neighbour"), removed(made("neighbour"))
+    assert result.added is not None
+    final = scene.gaussians.take(result.keep).extended(result.added)
+    for view in views(scene):
+        blue = (view.image[..., 2].astype(int) - view.image[..., 0] > 80).astype(np.uint8)
+        inside = cv2.erode(blue, np.ones((5, 5), np.uint8)) > 0
+        if inside.any():
+            drawn = render_bytes(final, view.camera)
+            assert np.abs(drawn.astype(int) - view.image)[inside].mean() < 3, view.camera.id
+
+
 def test_what_changed_is_removed_and_added() -> None:
     scene, result = made("waves"), removed(made("waves"))
     assert result.added is not None
