@@ -146,7 +146,7 @@ def marked_shadow(
 
     Its edge is as soft as photos show it: shapes of several softnesses share the strength.
     """
-    grounds = look_at(planes, views, witnesses, region)
+    grounds = look_at(planes, views, witnesses, region) if planes else []
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
     receivers = [Receiver.make(g) for g in grounds]
