@@ -652,11 +652,12 @@ def _drawn_surface(
     diagonal: float,
 ) -> _Drawn | None:
     """None where the views show too little of it."""
-    cells = 2  # px of a chart that share their points
+    cells, enough = 2, 64  # px of a chart that share their points, and how many of those
     h, w = -(-camera.height // cells), -(-camera.width // cells)
 
     ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
     corners = camera.unproject(ends, np.full(4, flat.max(), float))
+    middle = corners.mean(0)
 
     def of(view: ViewMasks, witness: Witness) -> np.ndarray:
         z = np.where(witness.hidden | (view.alpha_before < 0.9) | view.occluder, 0, view.depth_before)
@@ -664,7 +665,9 @@ def _drawn_surface(
         window = (slice(0, view.camera.height), slice(0, view.camera.width))
         if (front > 0).all():
             window = window_round(uv, view.camera, 8)
-        points = surface_points(view.camera, z, window)[2]
+        away = float(view.camera.project(middle[None])[1][0])
+        side = cells * flat.max() / camera.fx * view.camera.fx / away if away > 0 else 1  # of a cell, in its pixels
+        points = surface_points(view.camera, z, window, max(1, int(side * math.sqrt(len(views) / enough))))[2]
         uv, z = camera.project(points)
         with np.errstate(invalid="ignore"):
             ok = (z > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)

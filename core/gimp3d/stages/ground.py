@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -34,7 +34,6 @@ FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
 MIXED = 3.0  # … and pixels of the views that show the place best
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
-TEXTURED = 2  # by which pictures are shrunk whose textures tell planes from reliefs
 
 
 @dataclass(frozen=True)
@@ -60,25 +59,21 @@ def look_at(
     planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
 ) -> list[Ground]:
     """What photos show of the surfaces round the object, where they show enough."""
-    textures = Textures.make(witnesses, shrink=TEXTURED)
-    looked = (_look_at(plane, planes, views, witnesses, textures, region) for plane in planes)
+    looked = (_look_at(plane, planes, views, witnesses, region) for plane in planes)
     return [ground for ground in looked if ground.known.sum() >= FEWEST]
 
 
 def _look_at(
-    plane: Plane,
-    planes: Sequence[Plane],
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],
-    textures: Textures,
-    region: Region,
+    plane: Plane, planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
 ) -> Ground:
     diagonal = extent(region)
-    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), diagonal / DENSITY)
-    softened = parallel_map(lambda w: _softened(w, plane.origin, diagonal / DENSITY), witnesses)
-    surface = surface_at(camera, away, plane, region, views, witnesses, textures, ChartSettings())
-    said = ask(softened, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
-    image, spread = mosaic(surface.points, plane.normal, softened, said)
+    texel = diagonal / DENSITY
+    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
+    beside = max(BESIDE, math.ceil(MIXED * pixel_size(plane.origin, plane.normal, views) / texel))
+    views, witnesses = zip(*parallel_map(lambda p: _shrunk(*p, plane.origin, texel), list(zip(views, witnesses))))
+    surface = surface_at(camera, away, plane, region, views, witnesses, Textures.make(witnesses), ChartSettings())
+    said = ask(witnesses, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
+    image, spread = mosaic(surface.points, plane.normal, witnesses, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
     there = np.ones(photos.shape, bool)
     for other in planes:
@@ -87,18 +82,32 @@ def _look_at(
     known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = ((photos <= 1) & (hidden > 0)).astype(np.uint8)
-    beside = max(BESIDE, math.ceil(MIXED * pixel_size(plane.origin, plane.normal, views) * DENSITY / diagonal))
     hole = cv2.dilate(hole, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0
     return Ground(plane, camera, surface.depth, there, image, known & ~hole, hole)
 
 
-def _softened(witness: Witness, place: np.ndarray, texel: float) -> Witness:
-    """The photo blurred to a texel's size at a place, without the object."""
-    z = float(witness.camera.project(place[None])[1][0])
-    sigma = 0.35 * texel * witness.camera.fx / z if z > 0 else 0.0
-    if sigma < 0.6:
-        return witness
-    shown = (~(witness.hidden | witness.beside)).astype(np.float32)
-    total = cv2.GaussianBlur(witness.photo * shown[..., None], (0, 0), sigma)
-    weight = cv2.GaussianBlur(shown, (0, 0), sigma)
-    return replace(witness, photo=np.clip(total / np.maximum(weight, 1e-3)[..., None], 0, 255).astype(np.uint8))
+def _shrunk(view: ViewMasks, witness: Witness, place: np.ndarray, texel: float) -> tuple[ViewMasks, Witness]:
+    """The view at about a texel's resolution at a place; colours are those beside the object."""
+    camera = view.camera
+    z = float(camera.project(place[None])[1][0])
+    factor = int(0.5 * texel * camera.fx / z) if z > 0 else 1
+    factor = min(factor, camera.width // 2, camera.height // 2)
+    if factor < 2:
+        return view, witness
+    h, w = camera.height // factor, camera.width // factor
+    sizes = {"width": w, "height": h, **{k: getattr(camera, k) / factor for k in ("fx", "fy", "cx", "cy")}}
+    small = replace(camera, **sizes)
+    middle = slice(factor // 2, h * factor, factor), slice(factor // 2, w * factor, factor)
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        return values[: h * factor, : w * factor].reshape(h, factor, w, factor, *values.shape[2:])
+
+    hidden, beside = (np.ascontiguousarray(m[middle]) for m in (witness.hidden, witness.beside))
+    shown = ~(witness.hidden | witness.beside)
+    count = blocks(shown).sum((1, 3))
+    total = blocks(np.where(shown[..., None], witness.photo, 0)).sum((1, 3), dtype=np.int32)
+    mean = (total / np.maximum(count, 1)[..., None]).astype(np.uint8)
+    photo = np.where(count[..., None] > 0, mean, witness.photo[middle])
+    depth = np.ascontiguousarray(witness.depth[middle])
+    maps = {f.name: getattr(view, f.name)[middle] for f in fields(view) if f.name != "camera"}
+    return replace(view, camera=small, **maps), Witness(small, photo, hidden, beside, depth)

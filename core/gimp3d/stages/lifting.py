@@ -21,7 +21,7 @@ from .witness import Witness
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
 UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
-DARKEST = 0.15  # share of light below which a photo holds too little texture to be lifted: it is filled
+DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 SAME = 0.05  # relative z up to which what is drawn nearer than an unknown ground is still that ground
@@ -66,8 +66,7 @@ def lift_shadow(
 
     def lifted(witness: Witness, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         shaded = (light.min(-1) < UNTOUCHED) & ~witness.hidden
-        mixed = cv2.dilate((witness.hidden | witness.beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        dark = shaded & (light.mean(-1) < np.where(mixed, MIXED, DARKEST))
+        dark = shaded & (light.mean(-1) < np.where(_mixed(witness), MIXED, DARKEST))
         bright = encoded(linear(witness.photo[shaded]) / np.maximum(light[shaded], DARKEST))
         photo = witness.photo.copy()
         photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
@@ -138,8 +137,13 @@ def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarra
     before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
     proven = known & (off < ALIKE) & (hits.depth > 0)
     rough = proven.any() and before[proven].mean() > ROUGH  # what is drawn before it says nothing here
-    is_it = np.where(known, proven, ~before | (hole & rough)) & (hits.depth > 0)
+    is_it = np.where(known, proven, ~before | (hole & (rough | _mixed(witness)))) & (hits.depth > 0)
     return cv2.medianBlur(is_it.astype(np.uint8), PATCH) > 0  # highlights are specks
+
+
+def _mixed(witness: Witness) -> np.ndarray:
+    """[H, W] bool: right beside the object, where colours and depths may be the object's own."""
+    return cv2.dilate((witness.hidden | witness.beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
 
 
 def _brighter(
