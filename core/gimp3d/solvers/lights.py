@@ -75,15 +75,20 @@ class Lit:
         other = scipy.linalg.solve_triangular(root, other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
-    def fit(self, shadows: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Strengths ≥ 0 of shadows [T, S], coefficients of what is besides [B], and the loss that is left.
+    def fit(
+        self,
+        shadows: np.ndarray,  # [T, S]
+        least: np.ndarray | float = 0.0,  # [S] of strengths
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Strengths of shadows, coefficients of what is besides [B], and the loss that is left.
 
         Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
         count, shadows = shadows.shape[1], shadows.astype(np.float64)
         x = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
-        least = np.concatenate([np.zeros(count), np.full(len(x) - count, -np.inf)])
-        most = np.where(least == 0, 1.0, np.inf)
+        x[:count] = least
+        least, most = x.copy(), np.ones(len(x))
+        least[count:], most[count:] = -np.inf, np.inf
         loss = self.loss(self.residual(shadows @ x[:count], x[count:]))
         for _ in range(STEPS):  # Gauss and Newton's, reweighted; bounded, and halved until it helps
             residual = self.residual(shadows @ x[:count], x[count:])

@@ -92,7 +92,9 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     camera, depth = witness.camera, witness.depth
     hits = first_hits(shadow.grounds, camera, depth > 0)
     on = np.where(_shows(witness, shadow.grounds, hits), hits.chart, -1).astype(int)
-    points = camera.unproject(camera.pixel_centres(), np.where(on >= 0, hits.depth, depth).astype(np.float64))
+    below = (on < 0) & (hits.depth > 0) & (depth > (1 + SAME) * hits.depth)  # drawn where nothing can be seen
+    depth = np.where(below, 0, np.where(on >= 0, hits.depth, depth))
+    points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64))
     out = np.ones((*depth.shape, 3), np.float32)
 
     def ask(rows: np.ndarray, cols: np.ndarray) -> None:

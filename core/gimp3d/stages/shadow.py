@@ -21,6 +21,7 @@ from .masks import ViewMasks
 from .occluder import Occluder
 from .witness import Says, Witness, ask
 
+DULL = 0.5  # share of the light that the object takes from a surface and does not give back
 FINER = 2  # times as many along a side, in which it is stored
 EDGES = (0.7, 1.5, 3.0, 6.0)  # texels, σ of the edges that a marked shadow may have
 
@@ -101,22 +102,24 @@ def find_shadow(
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
     grounds = look_at(planes, views, witnesses, region)
-    fine = [Receiver.make(g) for g in grounds]
-    receivers = [half for half in (r.halved() for r in fine) if half.surface.shown.sum() >= FEWEST]
+    receivers = [half for half in (Receiver.make(g).halved() for g in grounds) if half.surface.shown.sum() >= FEWEST]
     if not receivers:
         return "no shadow found: photos do not show the surface round the object"
-    lights, told = search(Stage.make(occluder, receivers))
+    stage = Stage.make(occluder, receivers)
+    lights, told = search(stage)
     if not lights:
         return (
             f"no shadow found: the best light explains {told.over_chance:.1f} times what chance does, "
             f"{told.share:.0%} of what is uneven where its shadow would fall"
         )
-    stage = Stage.make(occluder, fine)
     sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
     lights = [*stage.settled(lights, [sky], FINEST), sky]
     casts = stage.casts(lights)
-    broad = Lit.make([r.surface for r in fine], BROAD, bent=False)
-    strength, besides, _ = broad.fit(casts)
+    broad = Lit.make([r.surface for r in receivers], BROAD, bent=False)
+    # what comes from no light comes from the sky: wide shadows of that are hardly told from paint
+    suns, skies = casts[:, :-1] - DULL * casts[:, -1:], casts[:, -1:]
+    strength, besides, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
+    strength[-1] -= DULL * strength[:-1].sum()
     tints = broad.tints(casts, strength)
     explained = broad.explained(casts @ strength, besides)
     lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
