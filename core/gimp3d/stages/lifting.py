@@ -9,18 +9,18 @@ import cv2
 import numpy as np
 
 from ..gaussians import SH_C0, Gaussians
-from ..raster import PixelRegion, label_weights, pixel_region
+from ..raster import PixelRegion, Window, label_weights, pixel_region
 from ..srgb import decoded, encoded, linear
 from ..threads import parallel_map
 from .charts import Hits, first_hits
 from .ground import Ground
+from .outline import window_round
 from .seed import missing_colours
-from .shadow import Shadow
+from .shadow import UNTOUCHED, Shadow
 from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
-UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
@@ -28,6 +28,7 @@ SAME = 0.05  # relative z up to which what is drawn nearer than an unknown groun
 ROUGH = 0.1  # share of the ground that is drawn that much nearer, from which depths tell nothing
 MIXED = 0.75  # the same right beside the object, whose own colours, in the same pixels, would be lifted too
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
+COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
 LOOKS = 12  # views by which colours are corrected
 CORRECTIONS = 3  # steps
 HOLD = 3.0  # px of blend weight by which colours are held
@@ -63,37 +64,63 @@ def lift_shadow(
 ) -> Lifted:
     """Divide linear light by the share of it that arrives, in photos and in the Gaussians that they show in shadow."""
     arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
-
-    def lifted(witness: Witness, light: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        shaded = (light.min(-1) < UNTOUCHED) & ~witness.hidden
-        dark = shaded & (light.mean(-1) < np.where(_mixed(witness), MIXED, DARKEST))
-        bright = encoded(linear(witness.photo[shaded]) / np.maximum(light[shaded], DARKEST))
-        photo = witness.photo.copy()
-        photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
-        return photo, shaded, dark
-
-    photos, shaded, dark = zip(*(lifted(w, a) for w, a in zip(witnesses, arriving)))
+    photos, shaded, dark, light = zip(*parallel_map(lambda p: _lifted(*p), list(zip(witnesses, arriving))))
     rows, sh = _brighter(scene, removed, witnesses, arriving)
     clear = [s & ~d & ~w.beside for s, d, w in zip(shaded, dark, witnesses)]
     sh = _matched(scene, removed, rows, sh, witnesses, photos, clear)
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
-    light = tuple(np.rint(a.mean(-1) * 255).astype(np.uint8) for a in arriving)
     before = tuple(w.photo for w in witnesses)
     return Lifted(before, photos, light, shaded, dark, rows, sh, shadow.confidence, words)
 
 
-def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
-    """[H, W, 3] the share of light that arrives at what a view shows; 1 where it shows nothing.
+@dataclass(frozen=True)
+class Arriving:
+    """The light in a part of a view; all of it arrives in the rest."""
+
+    window: Window
+    light: np.ndarray  # [h, w, 3] float32, the share of light that arrives at what is shown
+
+    def dimness(self) -> np.ndarray:
+        """[h, w] float32 in [0, 1]: how dark, 1 at DARKEST and below."""
+        return np.log(np.maximum(_grey(self.light), DARKEST)) / np.float32(np.log(DARKEST))
+
+
+def _grey(light: np.ndarray) -> np.ndarray:
+    """[H, W] the mean over channels."""
+    return cv2.transform(light, np.full((1, 3), 1 / 3))
+
+
+def _lifted(witness: Witness, arriving: Arriving) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A photo without the shadow, what changed in it, what is too dark for that, and the light of 255."""
+    photo, light = witness.photo.copy(), np.full(witness.hidden.shape, 255, np.uint8)
+    shaded, dark = np.zeros((2, *light.shape), bool)
+    part, window = witness.cropped(arriving.window), arriving.window
+    grey = _grey(arriving.light)
+    light[window] = np.rint(grey * 255)
+    shaded[window] = (grey < UNTOUCHED) & ~part.hidden
+    dark[window] = shaded[window] & (grey < np.where(_mixed(part), MIXED, DARKEST))
+    inside = shaded[window]
+    bright = encoded(linear(part.photo[inside]) / np.maximum(arriving.light[inside], DARKEST))
+    photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
+    return photo, shaded, dark, light
+
+
+def light_in(shadow: Shadow, witness: Witness) -> Arriving:
+    """The share of light that arrives at what a view shows; all where it shows nothing.
 
     Where the photo looks as the others show the ground there, it is the ground, whatever the drawn depth: splats'
     depths are rough. What is drawn before it, and looks otherwise, stands on it.
     """
+    uv, z = witness.camera.project(shadow.reach)
+    whole = slice(0, witness.camera.height), slice(0, witness.camera.width)
+    window = window_round(uv, witness.camera, 2 * STRIDE) if (z > 0).all() else whole
+    witness = witness.cropped(window)
     camera, depth = witness.camera, witness.depth
     hits = first_hits(shadow.grounds, camera, depth > 0)
     on = np.where(_shows(witness, shadow.grounds, hits), hits.chart, -1).astype(int)
     below = (on < 0) & (hits.depth > 0) & (depth > (1 + SAME) * hits.depth)  # drawn where nothing can be seen
-    depth = np.where(below, 0, np.where(on >= 0, hits.depth, depth))
+    depth = np.where(below | (witness.hidden & (on < 0)), 0, np.where(on >= 0, hits.depth, depth))
     points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64))
     out = np.ones((*depth.shape, 3), np.float32)
 
@@ -109,9 +136,9 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
     few = out[grid]
     if few.min() > UNTOUCHED:
-        return out
+        return Arriving(window, np.ones_like(out))
     kernel = np.ones((3, 3), np.uint8)
-    dim = few.mean(-1)
+    dim = _grey(few)
     uneven = cv2.dilate(dim, kernel) - cv2.erode(dim, kernel) > EVEN
     numbers = on[grid].astype(np.float32)
     uneven |= (cv2.dilate(numbers, kernel) != cv2.erode(numbers, kernel)) & (cv2.erode(dim, kernel) < UNTOUCHED)
@@ -122,7 +149,7 @@ def light_in(shadow: Shadow, witness: Witness) -> np.ndarray:
     x, y = np.meshgrid(x, y)
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
-    return out
+    return Arriving(window, out)
 
 
 def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarray:
@@ -149,7 +176,7 @@ def _mixed(witness: Witness) -> np.ndarray:
 
 
 def _brighter(
-    scene: Gaussians, removed: np.ndarray, witnesses: Sequence[Witness], arriving: Sequence[np.ndarray]
+    scene: Gaussians, removed: np.ndarray, witnesses: Sequence[Witness], arriving: Sequence[Arriving]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows [M] and new colours [M, K, 3] of the Gaussians that photos show in the shadow.
 
@@ -159,17 +186,22 @@ def _brighter(
     stays = np.flatnonzero(~removed)
     kept = scene.take(stays)
 
-    def of(pair: tuple[Witness, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
-        witness, light = pair
-        logs = np.log(np.maximum(light, DARKEST))
-        dim = -logs.mean(-1) / -np.log(DARKEST)
+    def of(pair: tuple[Witness, Arriving]) -> tuple[np.ndarray, np.ndarray] | None:
+        witness, arriving = pair
+        dim = np.zeros(witness.hidden.shape, np.float32)
+        logs = np.zeros((*dim.shape, 3), np.float32)
+        dim[arriving.window] = arriving.dimness()
+        logs[arriving.window] = np.log(np.maximum(arriving.light, DARKEST))
+        camera = witness.camera.scaled(1 / COARSER)
+        few = np.s_[: COARSER * camera.height : COARSER, : COARSER * camera.width : COARSER]
+        dim, logs, hidden = (a[few] for a in (dim, logs, witness.hidden))
         if not (dim > 0).any():
             return None
-        labels = np.where(witness.hidden, 0, 1 + np.minimum(np.ceil(dim * BINS), BINS)).astype(np.uint8)
+        labels = np.where(hidden, 0, 1 + np.minimum(np.ceil(dim * BINS), BINS)).astype(np.uint8)
         count = np.bincount(labels.ravel(), minlength=BINS + 2)
         level = np.stack([np.bincount(labels.ravel(), logs[..., k].ravel(), BINS + 2) for k in range(3)], 1)
         level = (level / np.maximum(count, 1)[:, None])[1:]
-        weights = label_weights(kept, witness.camera, labels, BINS + 1)
+        weights = label_weights(kept, camera, labels, BINS + 1)
         return weights.sum(0), weights.T @ level.astype(np.float32)
 
     total, dimmed = np.zeros(len(kept)), np.zeros((len(kept), 3))
@@ -180,7 +212,7 @@ def _brighter(
                 total += part[0]
                 dimmed += part[1]
     light = np.exp(dimmed / np.maximum(total, 1e-9)[:, None])
-    rows = np.flatnonzero((total > SHOWN) & (light.min(1) < UNTOUCHED))
+    rows = np.flatnonzero((COARSER**2 * total > SHOWN) & (light.min(1) < UNTOUCHED))
     sh = kept.sh[rows].astype(np.float64)
     colour = np.clip(0.5 + SH_C0 * sh[:, 0], 0.02, 1.0)
     gain = encoded(decoded(colour) / light[rows]) / colour

@@ -71,6 +71,11 @@ class Occluder:
         """[3] sides of the volume."""
         return np.array(self.thickness.shape) * self.cell
 
+    @property
+    def top(self) -> float:
+        """Its height above the plane."""
+        return float(self.low[2] + self.size[2])
+
     def moved(self, x: float, y: float) -> Occluder:
         """The same object elsewhere on the plane."""
         return replace(self, low=self.low + np.array([x, y, 0.0]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -22,6 +23,7 @@ from .occluder import Occluder
 from .witness import Says, Witness, ask
 
 DULL = 0.5  # share of the light that the object takes from a surface and does not give back
+UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
 FINER = 2  # times as many along a side, in which it is stored
 EDGES = (0.7, 1.5, 3.0, 6.0)  # texels, σ of the edges that a marked shadow may have
 
@@ -58,6 +60,18 @@ class Shadow:
             near = ((uv >= 0) & (uv < self.grounds[0].known.shape[::-1])).all(1)  # no shadow is looked for elsewhere
             light[near] -= taken_from(self.occluder, self.lights, points[near])
         return light
+
+    @cached_property
+    def reach(self) -> np.ndarray:
+        """[N, 3] points round the space that it may reach: where it falls on grounds, and as high as the object."""
+        points = []
+        for ground, taken in zip(self.grounds, self.taken):
+            there = cv2.resize(taken, ground.known.shape[::-1], interpolation=cv2.INTER_AREA).max(-1) > 1 - UNTOUCHED
+            points.append(ground.points()[::2, ::2][there[::2, ::2] & ground.there[::2, ::2]])
+        low = np.concatenate(points)
+        if self.occluder is None:
+            return low
+        return np.concatenate([low, low + self.occluder.top * self.occluder.plane.normal])
 
     def facts(self) -> dict[str, Any]:
         """For the summary: lights by degrees, strengths in shares of light."""

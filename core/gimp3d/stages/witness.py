@@ -11,7 +11,9 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel, kernel
+from ..raster import Window
 from ..threads import parallel_map, run_ranges
+from .outline import cropped
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUD = 127  # grey levels beyond which a difference counts no more; kept as int8
@@ -41,6 +43,10 @@ class Witness:
     hidden: np.ndarray  # [H, W] bool, where the photo shows the object
     beside: np.ndarray  # [H, W] bool, where it may show some of it
     depth: np.ndarray  # [H, W] float32 z of the scene with the object, 0 = nothing
+
+    def cropped(self, window: Window) -> Witness:
+        maps = (np.ascontiguousarray(a[window]) for a in (self.photo, self.hidden, self.beside, self.depth))
+        return Witness(cropped(self.camera, window), *maps)
 
 
 def pack(camera: Camera) -> np.ndarray:
