@@ -402,7 +402,7 @@ def _summary(
             "removed": removed,
             "added": added,
             "gaussians_out": len(file.gaussians) - removed + added,
-            "lifted": result.shadow.get("gaussians", 0),
+            "lifted": result.lifted,
             **_cost(file, result.added),
             "views": result.views,
             "hole_pixels": result.hole_pixels,
@@ -412,6 +412,7 @@ def _summary(
         "selection": result.selection,
         "proposed": result.proposed,
         "shadow": result.shadow,
+        "reflection": result.reflection,
         "charts": [
             {
                 "kind": chart.kind,

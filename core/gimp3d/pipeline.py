@@ -26,10 +26,10 @@ from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_numbe
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
-from .stages.ground import Ground
+from .stages.ground import Ground, look_at
 from .stages.growth import Growth
 from .stages.layers import LayerSettings
-from .stages.lifting import Lifted, lift_shadow
+from .stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from .stages.light_search import Light
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
 from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
@@ -63,6 +63,7 @@ from .stages.refine import (
 )
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
+from .stages.reflection import Reflection, find_reflection
 from .stages.shadow import Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
@@ -168,6 +169,8 @@ class RemovalResult:
     verdict: Verdict | None = None  # None where nothing was removed
     proposed: dict[str, Any] = field(default_factory=dict)  # what of the object the boxes cut off, see Growth.facts
     shadow: dict[str, Any] = field(default_factory=dict)  # see Shadow.facts
+    reflection: dict[str, Any] = field(default_factory=dict)  # see Reflection.facts
+    lifted: int = 0  # Gaussians that are removed and added as their light changed
 
 
 class Store(Protocol):
@@ -404,7 +407,7 @@ def with_charts(
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
     settings: RemovalSettings = RemovalSettings(),
     shadow_masks: Mapping[str, np.ndarray] | None = None,
-) -> tuple[Masks, tuple[Chart, ...], Lit]:
+) -> tuple[Masks, tuple[Chart, ...], Relit]:
     """The masks that a removal really uses, its charts with what photos show of them (see _to_paint), and the shadow.
 
     If there are any, the masks' targets are what no photo shows of them.
@@ -439,11 +442,12 @@ class Surfaces:
 
 
 @dataclass(frozen=True)
-class Lit:
-    """The object's shadow undone, or why it is not."""
+class Relit:
+    """What the object does to the light round it undone, or why it is not."""
 
     lifted: Lifted | None
     shadow: dict[str, Any]  # see Shadow.facts
+    reflection: dict[str, Any]  # see Reflection.facts
 
     def photos(self, views: Sequence[ViewMasks]) -> dict[str, np.ndarray]:
         assert self.lifted is not None
@@ -453,29 +457,34 @@ class Lit:
         return {v.camera.id: s for v, s in zip(views, self.lifted.shaded)} if self.lifted else {}
 
     def pictures(self, views: Sequence[ViewMasks], shown: ViewMasks) -> list[Picture]:
-        """A view's photo, the light that arrives, and the photo without the shadow; nothing if none falls there."""
+        """A view's photo, the light that arrives, and the photo as it would be; nothing if nothing changes there."""
         for k, view in enumerate(views):
             if view.camera.id == shown.camera.id and self.lifted is not None and self.lifted.shaded[k].any():
-                title = f"The object's shadow in {view.camera.id}: photo, light that arrives, lifted"
+                what = [n for n, f in (("shadow", self.shadow), ("reflection", self.reflection)) if f["found"]]
+                title = f"The object's {' and '.join(what)} in {view.camera.id}: photo, what is left alone, undone"
                 lifted = self.lifted
                 return [Picture("shadow", title, lifted.before[k], (lifted.light[k], lifted.photos[k]))]
         return []
 
     def with_changes(self, result: RemovalResult, scene: Gaussians) -> RemovalResult:
-        """The result with the Gaussians that were in shadow: as any changed row, they are removed and added."""
+        """The result with the Gaussians whose light changed: as any changed row, they are removed and added."""
+        result = replace(result, shadow=self.shadow, reflection=self.reflection)
         if self.lifted is None or not len(self.lifted.rows):
-            return replace(result, shadow=self.shadow)
+            return result
         changed = np.zeros(len(scene), bool)
         changed[self.lifted.rows] = True
         changed &= result.keep  # some were taken away since
-        brighter = self.lifted.scene(scene).take(changed)
-        added = brighter if result.added is None else brighter.extended(result.added)
-        shadow = {**self.shadow, "gaussians": int(changed.sum())}
-        return replace(result, keep=result.keep & ~changed, added=added, shadow=shadow)
+        relit = self.lifted.scene(scene).take(changed)
+        added = relit if result.added is None else relit.extended(result.added)
+        return replace(result, keep=result.keep & ~changed, added=added, lifted=int(changed.sum()))
 
 
-NOT_LIT = Lit(None, {"found": False, "lights": [], "explained": 0.0, "reason": "not looked for"})
-
+NOT_LOOKED_FOR = "not looked for"
+NOT_LIT = Relit(
+    None,
+    {"found": False, "lights": [], "explained": 0.0, "reason": NOT_LOOKED_FOR},
+    {"found": False, "explained": 0.0, "reason": NOT_LOOKED_FOR},
+)
 
 def _charted(
     run: _Run,
@@ -485,7 +494,7 @@ def _charted(
     photos: dict[str, np.ndarray],  # at the splats' exposure
     settings: RemovalSettings,
     shadow_masks: Mapping[str, np.ndarray],
-) -> tuple[Charted, Lit]:
+) -> tuple[Charted, Relit]:
     """The surfaces that the object hid, without its shadow."""
     surfaces: Surfaces = run("surfaces", lambda: _surfaces(scene, region, masks, photos, settings))
     lit = _light(run, scene, region, masks, surfaces, photos, settings, shadow_masks)
@@ -518,40 +527,82 @@ def _light(
     photos: Mapping[str, np.ndarray],
     settings: RemovalSettings,
     shadow_masks: Mapping[str, np.ndarray],
-) -> Lit:
-    """Find the object's shadow, and undo it."""
+) -> Relit:
+    """Find the object's reflection and its shadow, and undo them."""
     if settings.shadow == "off":
         return NOT_LIT
-    witnesses = surfaces.witnesses(masks.views, photos)
+    witnesses, planes = surfaces.witnesses(masks.views, photos), surfaces.planes
 
     def find() -> Found:
+        if not planes:
+            none = "no surface is known round the object"
+            return Found(None, f"no reflection found: {none}", None, f"no shadow found: {none}")
+        grounds, gone = look_at(planes, masks.views, witnesses, region), scene.take(masks.removed)
+        reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
+        looked: Sequence[Witness] = witnesses
+        if isinstance(reflection, Reflection):
+            bare = bare_photos(reflection, witnesses)
+            looked = [replace(w, photo=photo) for w, (photo, _, _) in zip(witnesses, bare)]
+            grounds = look_at(planes, masks.views, looked, region)
         if settings.shadow == "mask":
-            given = [shadow_masks.get(v.camera.id) for v in masks.views]
-            shadow = marked_shadow(given, surfaces.planes, masks.views, witnesses, region)
+            shadow = marked_shadow([shadow_masks.get(v.camera.id) for v in masks.views], grounds, looked)
         else:
-            shadow = find_shadow(scene.take(masks.removed), surfaces.planes, masks.views, witnesses, region)
-        return Found(None, 0.0, shadow) if isinstance(shadow, str) else Found(shadow, shadow.confidence, shadow.reason)
+            shadow = find_shadow(gone, planes, grounds, region)
+        return Found.of(reflection, shadow)
 
     found: Found = run("light", find)
-    if found.shadow is None:
-        if settings.shadow == "mask":
-            run.warnings.append(found.reason)
-        return Lit(None, {**NOT_LIT.shadow, "reason": found.reason})
-    shadow = found.shadow
-    lifted: Lifted = run("lift", lambda: lift_shadow(scene, masks.removed, shadow, witnesses))
-    lit = Lit(lifted, {**shadow.facts(), "gaussians": len(lifted.rows), "reason": found.reason})
-    most = sorted(masks.views, key=lambda v: -int(lit.shaded(masks.views)[v.camera.id].sum()))
-    run.pictures += [picture for v in most[:2] for picture in lit.pictures(masks.views, v)]
-    return lit
+    if found.shadow is None and settings.shadow == "mask":
+        run.warnings.append(found.why_shadow)
+    facts = [
+        {**(what.facts() if what is not None else none), "reason": why}
+        for what, why, none in (
+            (found.shadow, found.why_shadow, NOT_LIT.shadow),
+            (found.reflection, found.why_reflection, NOT_LIT.reflection),
+        )
+    ]
+    if found.shadow is None and found.reflection is None:
+        return Relit(None, *facts)
+
+    def lift() -> Lifted:
+        first = None
+        lit, looked = scene, witnesses
+        if found.reflection is not None:
+            first = subtract_reflection(scene, masks.removed, found.reflection, witnesses)
+            lit, looked = first.scene(scene), [replace(w, photo=p) for w, p in zip(witnesses, first.photos)]
+        if found.shadow is None:
+            assert first is not None
+            return first
+        lifted = lift_shadow(lit, masks.removed, found.shadow, looked)
+        return lifted if first is None else lifted.after(first)
+
+    relit = Relit(run("lift", lift), *facts)
+    most = sorted(masks.views, key=lambda v: -int(relit.shaded(masks.views)[v.camera.id].sum()))
+    run.pictures += [picture for v in most[:2] for picture in relit.pictures(masks.views, v)]
+    return relit
 
 
 @dataclass(frozen=True)
 class Found:
-    """The object's shadow, if one is found."""
+    """What the object does to the light round it, as far as it is found."""
 
+    reflection: Reflection | None
+    why_reflection: str
     shadow: Shadow | None
-    confidence: float
-    reason: str
+    why_shadow: str
+
+    @classmethod
+    def of(cls, reflection: Reflection | str, shadow: Shadow | str) -> Found:
+        one = (None, reflection) if isinstance(reflection, str) else (reflection, reflection.reason)
+        other = (None, shadow) if isinstance(shadow, str) else (shadow, shadow.reason)
+        return cls(*one, *other)
+
+    @property
+    def confidence(self) -> float:
+        return min((f.confidence for f in (self.reflection, self.shadow) if f is not None), default=0.0)
+
+    @property
+    def reason(self) -> str:
+        return f"{self.why_shadow}; {self.why_reflection}"
 
 
 @dataclass(frozen=True)
@@ -1128,6 +1179,7 @@ STORED = (
     Masks,
     Occluder,
     Plane,
+    Reflection,
     Selection,
     Shadow,
     Surfaces,

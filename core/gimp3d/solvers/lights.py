@@ -33,7 +33,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Lit:
+class Shading:
     """Differences of log luminance between neighbouring blocks of all surfaces, and how to weigh them.
 
     T texels that are known, all surfaces one after the other; K differences; B things besides shadow that may explain
@@ -48,7 +48,7 @@ class Lit:
     hues: np.ndarray  # [K, 3] differences of a channel's log less that of luminance
 
     @classmethod
-    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int], bent: bool = True) -> Lit:
+    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int], bent: bool = True) -> Shading:
         """`levels` are sides of blocks, in texels; `bent`: light may change over a surface as a quadratic does.
 
         A light nearby makes that, and it is no shadow. But wide shadows of the sky look like it: to measure those,
@@ -152,7 +152,7 @@ class Lit:
         squares = [(self.weight * there * d**2).sum() for d in (before - made, before)]
         return float(np.clip(1 - squares[0] / max(squares[1], 1e-12), 0, 1))
 
-    def only(self, rows: np.ndarray) -> Lit:
+    def only(self, rows: np.ndarray) -> Shading:
         """With only these differences [K] bool counted."""
         return replace(self, weight=self.weight * rows)
 

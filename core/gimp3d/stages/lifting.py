@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import cv2
 import numpy as np
 
 from ..gaussians import SH_C0, Gaussians
-from ..raster import PixelRegion, Window, label_weights, pixel_region
+from ..raster import Window, label_weights, pixel_region
+from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
 from ..threads import parallel_map
 from .charts import Hits, first_hits
 from .ground import Ground
 from .outline import window_round
+from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow
 from .witness import Witness
@@ -30,8 +33,8 @@ MIXED = 0.75  # the same right beside the object, whose own colours, in the same
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
 COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
 LOOKS = 12  # views by which colours are corrected
-CORRECTIONS = 3  # steps
-HOLD = 3.0  # px of blend weight by which colours are held
+CORRECTIONS, HOLD = 3, 3.0  # steps, and px of blend weight by which lifted colours are held, which are nearly right
+UNMIRRORING, LOOSE = 10, 0.03  # the same for those of a reflection, which are quite others
 SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 
 
@@ -48,6 +51,19 @@ class Lifted:
     sh: np.ndarray  # [M, K, 3] their new ones
     confidence: float
     reason: str
+
+    def after(self, first: Lifted) -> Lifted:
+        """Both, one after the other; this one's scene is the first one's."""
+        rows = np.union1d(first.rows, self.rows)
+        sh = np.zeros((len(rows), *self.sh.shape[1:]), np.float32)
+        sh[np.searchsorted(rows, first.rows)] = first.sh
+        sh[np.searchsorted(rows, self.rows)] = self.sh
+        light = tuple(np.minimum(a, b) for a, b in zip(first.light, self.light))
+        shaded = tuple(a | b for a, b in zip(first.shaded, self.shaded))
+        confidence, words = min(first.confidence, self.confidence), f"{first.reason}; {self.reason}"
+        return replace(
+            self, before=first.before, light=light, shaded=shaded, rows=rows, sh=sh, confidence=confidence, reason=words
+        )
 
     def scene(self, scene: Gaussians) -> Gaussians:
         """The scene with the new colours."""
@@ -229,23 +245,92 @@ def _matched(
     witnesses: Sequence[Witness],
     photos: Sequence[np.ndarray],
     wanted: Sequence[np.ndarray],  # [H, W] bool, where they tell
+    corrections: int = CORRECTIONS,
+    hold: float = HOLD,
+    degree: int = 0,  # of the SH that are corrected
+    steady: Mapping[int, np.ndarray] = MappingProxyType({}),  # [M] by witness, blend weights in what stays as it is
 ) -> np.ndarray:
-    """The colours corrected so that the scene, drawn, shows the lifted photos: least squares (SIRT), c_0 alone."""
+    """The colours corrected so that the scene, drawn, shows the new photos: least squares (SIRT)."""
     if not len(rows):
         return sh
     others = ~removed
     others[rows] = False
     rest, lit = scene.take(others), replace(scene.take(rows), sh=sh)
-    most = sorted(range(len(witnesses)), key=lambda k: -int(wanted[k].sum()))[:LOOKS]
-    looks = [(k, wanted[k]) for k in most if wanted[k].any()]
+    looks = [(k, wanted[k]) for k in most_shown(wanted)]
     regions = parallel_map(lambda p: pixel_region(rest, witnesses[p[0]].camera, p[1], passes=frozenset({"rgb"})), looks)
+    bands = (degree + 1) ** 2
+    means = lit.means.astype(np.float64)
+    towards = [means - witnesses[k].camera.centre for k, _ in looks]
+    bases = [sh_basis(t / np.linalg.norm(t, axis=1, keepdims=True), degree) / SH_C0 for t in towards]
+    change = np.zeros((len(rows), bands, 3))
+    for _ in range(corrections):
+        now = replace(lit, sh=(sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32))
+        steps = parallel_map(lambda p: missing_colours(p[0], now, p[1][1], photos[p[1][0]]), list(zip(regions, looks)))
+        bends = np.tile(hold * np.eye(bands), (len(rows), 1, 1))
+        slopes = np.zeros_like(change)
+        for (weights, missing), basis, (k, _) in zip(steps, bases, looks):
+            weight = weights[:, :1].astype(np.float64)
+            bends += ((weight + steady[k][:, None] if k in steady else weight) * basis)[:, :, None] * basis[:, None]
+            here = missing + weight * np.einsum("mk,mkc->mc", basis, change)
+            slopes += basis[:, :, None] * here[:, None]
+        change = np.linalg.solve(bends, slopes)
+    return (sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32)
 
-    def step(colours: Gaussians, region: PixelRegion, look: tuple[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        return missing_colours(region, colours, look[1], photos[look[0]])
 
-    for _ in range(CORRECTIONS):
-        steps = parallel_map(lambda p: step(*p), [(lit, region, look) for region, look in zip(regions, looks)])
-        corrected = lit.sh.copy()
-        corrected[:, 0] += sum(s[1] for s in steps) / (sum(s[0] for s in steps) + HOLD)
-        lit = replace(lit, sh=corrected)
-    return lit.sh
+def most_shown(wanted: Sequence[np.ndarray]) -> list[int]:
+    """The views by which colours are corrected: those that show most of what changes."""
+    order = sorted(range(len(wanted)), key=lambda k: -int(wanted[k].sum()))
+    return [k for k in order[:LOOKS] if wanted[k].any()]
+
+
+def bare_photos(
+    reflection: Reflection, witnesses: Sequence[Witness]
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each view: the photo without the mirror image's light, what changed in it, and of 255 how little."""
+
+    def of(witness: Witness) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        added = reflection.added(witness.camera)
+        changed = (np.abs(added).max(-1) > VISIBLE) & ~witness.hidden
+        hits = first_hits(reflection.grounds, witness.camera, changed)
+        before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
+        changed &= (hits.chart == 0) & ~before
+        photo, light = witness.photo.copy(), np.full(changed.shape, 255, np.uint8)
+        bare = linear(photo[changed]) - added[changed]
+        photo[changed] = np.clip(np.rint(encoded(np.maximum(bare, 0)) * 255), 0, 255)
+        light[changed] = np.clip(255 - 255 * np.abs(added[changed]).max(-1), 0, 255)
+        return photo, changed, light
+
+    return parallel_map(of, witnesses)
+
+
+def subtract_reflection(
+    scene: Gaussians,
+    removed: np.ndarray,  # [N] bool, the object
+    reflection: Reflection,
+    witnesses: Sequence[Witness],
+) -> Lifted:
+    """Take the mirror image's light out of photos and out of the Gaussians that they show there.
+
+    Trained splats hold reflections in what lies below the surface, in how its colours change with the view, or both:
+    all of their SH are corrected, held where photos stay as they are.
+    """
+    photos, changed, light = zip(*bare_photos(reflection, witnesses))
+    stays = np.flatnonzero(~removed)
+    kept = scene.take(stays)
+    looks = most_shown(changed)
+
+    def shown(k: int) -> np.ndarray:
+        labels = np.where(witnesses[k].hidden, 0, 1 + changed[k]).astype(np.uint8)
+        return label_weights(kept, witnesses[k].camera, labels, 2)
+
+    weights = dict(zip(looks, parallel_map(shown, looks)))
+    rows = np.flatnonzero(sum((w[1] for w in weights.values()), np.zeros(len(kept))) > SHOWN)
+    steady = {k: w[0, rows] for k, w in weights.items()}
+    rows = stays[rows]
+    clear = [c & ~w.beside for c, w in zip(changed, witnesses)]
+    how = (UNMIRRORING, LOOSE, scene.sh_degree, steady)
+    sh = _matched(scene, removed, rows, scene.sh[rows], witnesses, photos, clear, *how)
+    dark = tuple(np.zeros_like(c) for c in changed)
+    before = tuple(w.photo for w in witnesses)
+    words = f"{np.mean([c.mean() for c in changed]):.1%} of the views' pixels and {len(rows)} Gaussians show its reflection"
+    return Lifted(before, photos, light, changed, dark, rows, sh, reflection.confidence, words)

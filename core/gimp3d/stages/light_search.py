@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..solvers.lights import Lit, Surface
+from ..solvers.lights import Shading, Surface
 from ..srgb import linear
 from .charts import Plane
 from .ground import Ground
@@ -159,16 +159,16 @@ class Told:
 
 
 @dataclass(frozen=True)
-class Stage:
+class Scenery:
     """The object before its surroundings, to be lit."""
 
     occluder: Occluder
     receivers: Sequence[Receiver]
-    lit: Lit
+    lit: Shading
 
     @classmethod
-    def make(cls, occluder: Occluder, receivers: Sequence[Receiver]) -> Stage:
-        return cls(occluder, receivers, Lit.make([r.surface for r in receivers], LEVELS))
+    def make(cls, occluder: Occluder, receivers: Sequence[Receiver]) -> Scenery:
+        return cls(occluder, receivers, Shading.make([r.surface for r in receivers], LEVELS))
 
     def cast(self, light: Light) -> np.ndarray:
         """[T] the share of its light that does not arrive."""
@@ -220,15 +220,13 @@ class Stage:
         return found
 
 
-def search(stage: Stage) -> tuple[list[Light], Told]:
+def search(scenery: Scenery) -> tuple[list[Light], Told]:
     """The lights, and what speaks for the weakest; or for the best candidate, if there is none."""
-    lit, sky = stage.lit, _Sky.make()
-    shadows = sky.cast(stage.occluder, stage.receivers)
+    lit, sky = scenery.lit, _Sky.make()
+    shadows = sky.cast(scenery.occluder, scenery.receivers)
     own = lit.changes(shadows)
-    step = ASIDE * float(max(stage.occluder.size[:2]))
-    around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
-    moved = [stage.occluder.moved(step * math.cos(a), step * math.sin(a)) for a in around]
-    bright = [own, *(lit.changes(sky.cast(m, stage.receivers)) for m in moved)]
+    moved = [scenery.occluder.moved(x, y) for x, y in places_elsewhere(float(max(scenery.occluder.size[:2])))]
+    bright = [own, *(lit.changes(sky.cast(m, scenery.receivers)) for m in moved)]
     found: list[int] = []
     for _ in range(MOST):
         strength, besides, _ = lit.fit(shadows[:, found])
@@ -237,18 +235,24 @@ def search(stage: Stage) -> tuple[list[Light], Told]:
     lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
     settled = False
     while True:
-        told = stage.told(lights, bright)
+        told = scenery.told(lights, bright)
         worst = min(range(len(lights)), key=lambda k: told[k].enough if settled else told[k].over_chance)
         if told[worst].enough >= 1 if settled else told[worst].over_chance >= 1:
             if settled:
                 return lights, told[worst]
-            lights, settled = stage.settled(lights, [], COARSEST / 2), True
+            lights, settled = scenery.settled(lights, [], COARSEST / 2), True
             continue
         if len(lights) == 1:
             return [], told[0]
         lights.pop(worst)
         if settled:
-            lights = stage.settled(lights, [], COARSEST / 2)
+            lights = scenery.settled(lights, [], COARSEST / 2)
+
+
+def places_elsewhere(width: float) -> list[tuple[float, float]]:
+    """Ways along the plane to where an object of some width might as well stand."""
+    around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
+    return [(ASIDE * width * math.cos(a), ASIDE * width * math.sin(a)) for a in around]
 
 
 def _near(light: Light, step: float) -> list[Light]:

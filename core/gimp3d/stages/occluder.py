@@ -22,6 +22,13 @@ STANDS = 0.1  # of the diagonal: an object whose lowest parts are no higher stan
 STEP = 0.8  # cells that a ray goes at once
 
 
+def standing(gaussians: Gaussians, plane: Plane, diagonal: float) -> Gaussians:
+    """Those of the removed Gaussians that are an object on the plane: solid, and no haze or surface that went along."""
+    height = plane.local(gaussians.means.astype(np.float64))[:, 2]
+    solid = gaussians.usable & (gaussians.opacity > FAINT) & (gaussians.scales.max(1) < LARGE * diagonal)
+    return gaussians.take(solid & (height > LOW * diagonal))
+
+
 @dataclass(frozen=True)
 class Occluder:
     """What blocks light, in the axes of a plane: x and y along it, z its height."""
@@ -37,13 +44,11 @@ class Occluder:
 
         A Gaussian blocks as much as an opaque disk of area 2π σ₁ σ₂ · opacity, whichever way it lies.
         """
-        scales = -np.sort(-gaussians.scales, axis=1).astype(np.float64)
-        means = plane.local(gaussians.means.astype(np.float64))
-        blocks = gaussians.usable & (gaussians.opacity > FAINT) & (scales[:, 0] < LARGE * diagonal)
-        blocks &= means[:, 2] > LOW * diagonal
-        if blocks.sum() < SAMPLES:
+        g = standing(gaussians, plane, diagonal)
+        if len(g) < SAMPLES:
             return None
-        g, means, scales = gaussians.take(blocks), means[blocks], scales[blocks]
+        scales = -np.sort(-g.scales, axis=1).astype(np.float64)
+        means = plane.local(g.means.astype(np.float64))
         frame = np.stack([plane.right, plane.down, plane.normal])
         own = g.scales.astype(np.float64)
         own = np.concatenate([own, np.zeros((len(g), 3 - own.shape[1]))], axis=1)

@@ -14,11 +14,10 @@ import scipy.ndimage
 
 from ..box import Region
 from ..gaussians import Gaussians
-from ..solvers.lights import Lit
+from ..solvers.lights import Shading
 from .charts import Plane, extent
-from .ground import FEWEST, ROUGH, Ground, look_at
-from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Stage, search, taken_from
-from .masks import ViewMasks
+from .ground import FEWEST, ROUGH, Ground
+from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
 from .occluder import Occluder
 from .witness import Says, Witness, ask
 
@@ -99,8 +98,7 @@ class Shadow:
 def find_shadow(
     gone: Gaussians,  # the object
     planes: Sequence[Plane],  # of the surfaces round it, the support first
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],  # of the same views
+    grounds: Sequence[Ground],  # of those planes, as far as photos show them
     region: Region,
 ) -> Shadow | str:
     """The lights whose shadows of the object explain what is dark round it; or why there is none.
@@ -115,21 +113,20 @@ def find_shadow(
     occluder = Occluder.make(gone, planes[0], extent(region))
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
-    grounds = look_at(planes, views, witnesses, region)
     receivers = [half for half in (Receiver.make(g).halved() for g in grounds) if half.surface.shown.sum() >= FEWEST]
     if not receivers:
         return "no shadow found: photos do not show the surface round the object"
-    stage = Stage.make(occluder, receivers)
-    lights, told = search(stage)
+    scenery = Scenery.make(occluder, receivers)
+    lights, told = search(scenery)
     if not lights:
         return (
             f"no shadow found: the best light explains {told.over_chance:.1f} times what chance does, "
             f"{told.share:.0%} of what is uneven where its shadow would fall"
         )
     sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
-    lights = [*stage.settled(lights, [sky], FINEST), sky]
-    casts = stage.casts(lights)
-    broad = Lit.make([r.surface for r in receivers], BROAD, bent=False)
+    lights = [*scenery.settled(lights, [sky], FINEST), sky]
+    casts = scenery.casts(lights)
+    broad = Shading.make([r.surface for r in receivers], BROAD, bent=False)
     # what comes from no light comes from the sky: wide shadows of that are hardly told from paint
     suns, skies = casts[:, :-1] - DULL * casts[:, -1:], casts[:, -1:]
     strength, besides, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
@@ -154,22 +151,19 @@ def find_shadow(
 
 def marked_shadow(
     masks: Sequence[np.ndarray | None],  # [H, W] bool of the witnesses' views; None where the user marked none
-    planes: Sequence[Plane],
-    views: Sequence[ViewMasks],
+    grounds: Sequence[Ground],
     witnesses: Sequence[Witness],
-    region: Region,
 ) -> Shadow | str:
     """The shadow that a user marked: where most of the masks see it on a ground, as dark as photos show it there.
 
     Its edge is as soft as photos show it: shapes of several softnesses share the strength.
     """
-    grounds = look_at(planes, views, witnesses, region) if planes else []
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
     receivers = [Receiver.make(g) for g in grounds]
     shapes = [_marked_on(ground, masks, witnesses) for ground in grounds]
     shadows = np.concatenate([s[g.known] for s, g in zip(shapes, grounds)])
-    lit = Lit.make([r.surface for r in receivers], LEVELS)
+    lit = Shading.make([r.surface for r in receivers], LEVELS)
     strength, besides, _ = lit.fit(shadows)
     if strength.sum() < FAINT:
         return "what is marked as shadow is not darker than what is round it: nothing is lifted"

@@ -1,0 +1,192 @@
+"""The object's reflection in the surface that it stands on: what its mirror image adds to the light in photos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import nnls
+
+from ..box import Region
+from ..camera import Camera
+from ..gaussians import Gaussians
+from ..raster import render
+from ..srgb import decoded, linear
+from ..threads import parallel_map
+from .charts import Plane, extent
+from .ground import ROUGH, Ground
+from .light_search import EARNS, FITS, places_elsewhere
+from .occluder import standing
+from .witness import Says, Witness, ask
+
+MOST_VIEWS = 24
+SEVERAL = 3  # photos that must show a place before they can be compared
+ROUNDS = 8  # of reweighting
+LEAST_NOISE = 0.003  # of linear light
+MIRRORED = 0.3  # alpha of the mirror image from which it has to explain how photos differ
+VISIBLE = 0.004  # of linear light: about one grey level
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """How a plane mirrors the object: the light of its image, and what it gives back where that is not.
+
+    Both are of the same strength on all of the plane and from every side.
+    """
+
+    grounds: tuple[Ground, ...]  # first that which mirrors; the others may stand before it
+    gaussians: Gaussians  # the object
+    image: np.ndarray  # [3] share of the object's light that comes back, per channel
+    elsewhere: np.ndarray  # [3] linear light that comes back beside its image
+    explained: float  # share of what differs between photos, where the image is, that it explains
+    confidence: float  # that share, less what chance explains
+    reason: str
+
+    def added(self, camera: Camera) -> np.ndarray:
+        """[H, W, 3] float32 linear light that the mirror image adds to a view of the bare plane, or takes from it."""
+        alpha, light = mirror_image(self.gaussians, self.grounds[0].plane, camera)
+        return (light * self.image - alpha[..., None] * self.elsewhere).astype(np.float32)
+
+    def facts(self) -> dict[str, Any]:
+        """For the summary."""
+        return {
+            "found": True,
+            "strength": [round(float(x), 3) for x in self.image],
+            "elsewhere": [round(float(x), 3) for x in self.elsewhere],
+            "explained": round(self.explained, 3),
+            "confidence": round(self.confidence, 3),
+        }
+
+
+def mirror_image(gaussians: Gaussians, plane: Plane, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Alpha [H, W] and linear light times alpha [H, W, 3] of Gaussians seen in a plane mirror.
+
+    A mirrored camera sees them from the other side of the plane, left and right exchanged.
+    """
+    across = 2 * (plane.normal @ plane.origin) * plane.normal
+    exchanged = np.diag([-1.0, 1.0, 1.0])
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = exchanged @ camera.R @ (np.eye(3) - 2 * np.outer(plane.normal, plane.normal))
+    viewmat[:3, 3] = exchanged @ (camera.R @ across + camera.t)
+    other = replace(camera, viewmat=viewmat, cx=camera.width - camera.cx)
+    drawn = render(gaussians, other, passes=frozenset({"rgb"}))
+    alpha, rgb = drawn.alpha[:, ::-1], drawn.rgb[:, ::-1]
+    colour = np.clip(rgb / np.maximum(alpha, 1e-3)[..., None], 0, 1)
+    return np.ascontiguousarray(alpha), decoded(colour).astype(np.float32) * alpha[..., None]
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """What views show of texels, linear light; V views, T texels."""
+
+    seen: np.ndarray  # [V, T] bool
+    photo: np.ndarray  # [V, T, 3] float32
+    alpha: np.ndarray  # [V, T] of the mirror image …
+    light: np.ndarray  # [V, T, 3] … and its light, times alpha
+
+    @classmethod
+    def take(cls, points: np.ndarray, witnesses: Sequence[Witness], texel: float, image: partial) -> _Samples:
+        said = ask(witnesses, points, ROUGH)
+        parts = parallel_map(lambda w: _sampled(points, w, texel, image), witnesses)
+        photo, alpha, light = (np.array([p[k] for p in parts], np.float32) for k in range(3))
+        seen = said == Says.SEEN
+        several = seen.sum(0) >= SEVERAL
+        return cls(seen[:, several], photo[:, several], alpha[:, several], light[:, several])
+
+
+def _sampled(
+    points: np.ndarray, witness: Witness, texel: float, image: partial
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A photo, and the mirror image's alpha and light, at points; pictures are as fine as texels."""
+    uv, z = witness.camera.project(points)
+    away = float(np.median(z))
+    pixels = texel * witness.camera.fx / away if away > 0 else 1.0
+    camera = witness.camera.scaled(1 / max(1.0, pixels))
+    photo = cv2.resize(linear(witness.photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    size = camera.width / witness.camera.width, camera.height / witness.camera.height
+    x, y = (np.nan_to_num(uv, nan=-1e4) * size - 0.5).astype(np.float32).T[:, :, None]
+    alpha, light = image(camera)
+    return tuple(cv2.remap(p.astype(np.float32), x, y, cv2.INTER_LINEAR)[:, 0] for p in (photo, alpha, light))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How well a mirror image explains differences between photos of the same places."""
+
+    image: np.ndarray  # [3], see Reflection
+    elsewhere: np.ndarray  # [3]
+    gain: float  # by how much it lowers the squared differences, in units of noise
+    share: float  # of what differs where it is that it explains, noise left out
+
+    @classmethod
+    def of(cls, samples: _Samples) -> _Fit:
+        found, gain, before, after = np.zeros((2, 3)), 0.0, 0.0, 0.0
+        there = samples.seen & (samples.alpha > MIRRORED)
+        for channel in range(3):
+            weight = samples.seen.astype(np.float64)
+            for _ in range(ROUNDS):
+                photo, light, alpha = (
+                    v - (weight * v).sum(0) / np.maximum(weight.sum(0), 1e-9)
+                    for v in (samples.photo[..., channel], samples.light[..., channel], -samples.alpha)
+                )
+                bends = np.array([[(weight * a * b).sum() for b in (light, alpha)] for a in (light, alpha)])
+                slopes = np.array([(weight * a * photo).sum() for a in (light, alpha)])
+                # of a plain object both are alike: the smaller strengths, then
+                root = np.linalg.cholesky(bends + (1e-3 * np.trace(bends) + 1e-12) * np.eye(2))
+                strength = nnls(root.T, np.linalg.solve(root, slopes))[0]
+                left = photo - strength[0] * light - strength[1] * alpha
+                noise = max(1.4826 * float(np.median(np.abs(left[samples.seen]))), LEAST_NOISE)
+                weight = samples.seen / np.sqrt(1 + (left / noise) ** 2)
+            found[:, channel] = strength
+            squares = weight * np.stack([photo, left]) ** 2 / noise**2
+            gain += float(squares[0].sum() - squares[1].sum())
+            before += float((squares[0] - weight)[there].sum())
+            after += float((squares[1] - weight)[there].sum())
+        share = 1 - max(after, 0.0) / before if before > 0 else 0.0
+        return cls(*found, gain, share)
+
+
+def find_reflection(
+    gone: Gaussians,  # the object
+    plane: Plane,  # that it stands on
+    grounds: Sequence[Ground],
+    witnesses: Sequence[Witness],
+    region: Region,
+) -> Reflection | str:
+    """The reflection that explains how photos of the same places differ; or why there is none.
+
+    Whatever does not change with the view – texture, shadow – drops out of differences between photos of a place. A
+    reflection must explain most of them where the mirror image is, and clearly more than that of the object elsewhere.
+    """
+    mine = [ground for ground in grounds if ground.plane is plane]
+    object_ = standing(gone, plane, extent(region))
+    if not mine or not len(object_):
+        return "no reflection found: photos do not show the surface that the object stands on"
+    ground, others = mine[0], [g for g in grounds if g.plane is not plane]
+    used = [witnesses[k * len(witnesses) // MOST_VIEWS] for k in range(MOST_VIEWS)]
+    used = list(witnesses) if len(witnesses) <= MOST_VIEWS else used
+    known = np.zeros_like(ground.known)
+    known[::2, ::2] = ground.known[::2, ::2]
+    points = ground.points()[known]
+    texel = 2 * float(np.median(ground.depth)) / ground.camera.fx
+
+    def fit(gaussians: Gaussians) -> _Fit:
+        return _Fit.of(_Samples.take(points, used, texel, partial(mirror_image, gaussians, plane)))
+
+    own = fit(object_)
+    words = f"the mirror image explains {own.share:.0%} of how photos differ where it is"
+    if own.share < FITS:
+        return f"no reflection found: {words}"
+    width = np.ptp(plane.local(object_.means.astype(np.float64))[:, :2], axis=0).max()
+    moves = [x * plane.right + y * plane.down for x, y in places_elsewhere(float(width))]
+    chance = max(fit(replace(object_, means=(object_.means + m).astype(np.float32))).gain for m in moves)
+    over = own.gain / max(chance, 1e-9)
+    words += f", {over:.1f} times what it does elsewhere"
+    if over < EARNS:
+        return f"no reflection found: {words}"
+    confidence = own.share * (1 - 1 / over)
+    return Reflection((ground, *others), object_, own.image, own.elsewhere, own.share, confidence, words)
