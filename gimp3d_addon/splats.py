@@ -19,6 +19,7 @@ from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
 from gimp3d.sh import sh_basis
+from gimp3d.srgb import decoded
 
 from .native import attribute_values, is_native, read_native, write_native
 
@@ -151,8 +152,7 @@ def show_colours_from(obj: bpy.types.Object, eye: np.ndarray) -> None:
 
 def _shown_colours(encoded: np.ndarray) -> np.ndarray:
     """Gamma-encoded colours as Blender's linear ones with alpha, [N, 4] float32."""
-    encoded = np.clip(encoded, 0, 1)
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear = decoded(np.clip(encoded, 0, 1))
     return np.concatenate([linear, np.ones((len(linear), 1))], axis=1).astype(np.float32)
 
 

@@ -21,6 +21,7 @@ from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
+from gimp3d.raster import render
 from gimp3d.srgb import decoded, encoded
 
 STEP = 0.025  # between splats
@@ -161,6 +162,30 @@ def make_scene(
     hidden = (np.abs(with_shadow.means[:, :2]) < BLOCK / 2).all(1) & (np.abs(with_shadow.means[:, 2]) < 0.05)
     scene = with_shadow.take(~hidden).extended(cube(own, (0.85, 0.12, 0.1)))
     return LitScene(name, scene, under(others), tuple(lamps) if casts else ())
+
+
+def glossy_scene(strength: float, lamps: Sequence[Lamp] = ()) -> LitScene:
+    """A block on a floor that mirrors it, as trained splats hold that: seen through the floor, above another sky."""
+    scene = make_scene("glossy", lamps)
+    low = Box.make([0, 0, -BLOCK / 2 - 0.02], [BLOCK] * 3)
+    image = cube(low, (0.85, 0.12, 0.1))
+    top = image.means[:, 2] > -0.03  # cubes are open below, their mirror images above
+    image.means[top, 2] = -BLOCK - 0.02
+    x, y = (g.ravel() for g in np.meshgrid(*[np.arange(-6, 6, 0.25)] * 2))
+    sky = discs(np.stack([x, y, np.full_like(x, -2.5)], -1), (0, 0, 1), np.tile([0.55, 0.7, 0.85], (len(x), 1)), 0.25)
+
+    def seen_through(ground: Gaussians, opacity: float) -> Gaussians:
+        floor_ = np.abs(ground.means[:, 2]) < 0.01
+        logits = np.where(floor_, math.log(opacity / (1 - opacity)), ground.opacity_logits)
+        return replace(ground, opacity_logits=logits.astype(np.float32))
+
+    camera = scene.cameras()[0]
+    below = np.s_[-40:, 80:160]  # pixels that show the floor alone
+    tried = np.linspace(0.02, 0.9, 45)
+    alpha = [render(seen_through(scene.truth, o), camera, passes=frozenset({"rgb"})).alpha[below].mean() for o in tried]
+    opacity = float(np.interp(1 - strength, alpha, tried))
+    truth = seen_through(scene.truth, opacity).extended(sky)
+    return replace(scene, gaussians=seen_through(scene.gaussians, opacity).extended(image).extended(sky), truth=truth)
 
 
 def cube(box: Box, colour: tuple[float, float, float]) -> Gaussians:

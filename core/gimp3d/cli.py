@@ -21,10 +21,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from . import __version__
 from .errors import BadInput, Cancelled, Gimp3dError
-from .job import RemovalJob, load_job, save_job
+from .job import SHADOWS, RemovalJob, load_job, save_job
 
 Namespace = argparse.Namespace
-SHADOWS = ("auto", "off", "mask")  # as in commands, which takes a second to import
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
 IMAGES = "photos; none: views are rendered from the scene"
 GROW = "take along what of the object the boxes cut off"

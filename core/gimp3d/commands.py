@@ -23,7 +23,7 @@ from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, write_gaussians, write_ply
 from .jit import announce_compilation
-from .job import RemovalJob, write_atomically
+from .job import SHADOWS, RemovalJob, write_atomically
 from .orbit import measured_up, orbit_cameras
 from .pipeline import (
     PRESETS,
@@ -44,7 +44,6 @@ from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
 
-SHADOWS = ("auto", "off", "mask")
 PASSES = ("rgb", "alpha", "depth", "normal")
 
 

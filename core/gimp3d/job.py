@@ -19,6 +19,7 @@ from typing import IO, Any
 from .errors import BadInput
 
 JOB_VERSION = 1
+SHADOWS = ("auto", "off", "mask")  # what the object's own shadow is taken for
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class RemovalJob:
     out: str
     images: str | None = None  # folder; "none": views are rendered from the scene itself
     extra_masks: str | None = None  # folder of masks that are filled too: shadows, reflections
-    shadow: str = "auto"  # auto | off | mask
+    shadow: str = "auto"  # one of SHADOWS
     shadow_masks: str | None = None  # folder of masks of the object's shadow
     reference: str | None = None
     reference_image: str | None = None

@@ -61,9 +61,9 @@ from .stages.refine import (
     observed,
     refine_gaussians,
 )
+from .stages.reflection import Reflection, find_reflection
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
-from .stages.reflection import Reflection, find_reflection
 from .stages.shadow import Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
 from .stages.witness import Witness
@@ -485,6 +485,7 @@ NOT_LIT = Relit(
     {"found": False, "lights": [], "explained": 0.0, "reason": NOT_LOOKED_FOR},
     {"found": False, "explained": 0.0, "reason": NOT_LOOKED_FOR},
 )
+
 
 def _charted(
     run: _Run,

@@ -87,8 +87,8 @@ class Shading:
         count, shadows = shadows.shape[1], shadows.astype(np.float64)
         x = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
         x[:count] = least
-        least, most = x.copy(), np.ones(len(x))
-        least[count:], most[count:] = -np.inf, np.inf
+        low = np.concatenate([x[:count], np.full(len(x) - count, -np.inf)])
+        high = np.where(np.isfinite(low), 1.0, np.inf)
         loss = self.loss(self.residual(shadows @ x[:count], x[count:]))
         for _ in range(STEPS):  # Gauss and Newton's, reweighted; bounded, and halved until it helps
             residual = self.residual(shadows @ x[:count], x[count:])
@@ -99,7 +99,7 @@ class Shading:
             bends = scaled.T @ slopes
             root = np.linalg.cholesky(bends + (1e-9 * np.trace(bends) + 1e-12) * np.eye(len(x)))
             aim = scipy.linalg.solve_triangular(root, scaled.T @ residual, lower=True)
-            step = lsq_linear(root.T, aim, (least - x, most - x + 1e-12)).x
+            step = lsq_linear(root.T, aim, (low - x, high - x + 1e-12)).x
             for _ in range(HALVINGS):
                 tried = x + step
                 after = self.loss(self.residual(shadows @ tried[:count], tried[count:]))
@@ -108,7 +108,7 @@ class Shading:
                 step = step / 2
             gained = loss - after
             if gained > 0:
-                x, loss = np.clip(tried, least, most), after
+                x, loss = np.clip(tried, low, high), after
             if gained <= ENOUGH * loss:
                 break
         return x[:count], x[count:], loss

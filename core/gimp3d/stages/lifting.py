@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..gaussians import SH_C0, Gaussians
-from ..raster import Window, label_weights, pixel_region
+from ..raster import PixelRegion, Window, label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
 from ..threads import parallel_map
@@ -265,7 +265,7 @@ def _matched(
     change = np.zeros((len(rows), bands, 3))
     for _ in range(corrections):
         now = replace(lit, sh=(sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32))
-        steps = parallel_map(lambda p: missing_colours(p[0], now, p[1][1], photos[p[1][0]]), list(zip(regions, looks)))
+        steps = parallel_map(_step, [(region, now, mask, photos[k]) for region, (k, mask) in zip(regions, looks)])
         bends = np.tile(hold * np.eye(bands), (len(rows), 1, 1))
         slopes = np.zeros_like(change)
         for (weights, missing), basis, (k, _) in zip(steps, bases, looks):
@@ -275,6 +275,10 @@ def _matched(
             slopes += basis[:, :, None] * here[:, None]
         change = np.linalg.solve(bends, slopes)
     return (sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32)
+
+
+def _step(of: tuple[PixelRegion, Gaussians, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    return missing_colours(*of)
 
 
 def most_shown(wanted: Sequence[np.ndarray]) -> list[int]:
@@ -332,5 +336,6 @@ def subtract_reflection(
     sh = _matched(scene, removed, rows, scene.sh[rows], witnesses, photos, clear, *how)
     dark = tuple(np.zeros_like(c) for c in changed)
     before = tuple(w.photo for w in witnesses)
-    words = f"{np.mean([c.mean() for c in changed]):.1%} of the views' pixels and {len(rows)} Gaussians show its reflection"
+    share = np.mean([c.mean() for c in changed])
+    words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians show its reflection"
     return Lifted(before, photos, light, changed, dark, rows, sh, reflection.confidence, words)

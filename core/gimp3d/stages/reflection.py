@@ -124,7 +124,7 @@ class _Fit:
 
     @classmethod
     def of(cls, samples: _Samples) -> _Fit:
-        found, gain, before, after = np.zeros((2, 3)), 0.0, 0.0, 0.0
+        found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
         there = samples.seen & (samples.alpha > MIRRORED)
         for channel in range(3):
             weight = samples.seen.astype(np.float64)
@@ -144,10 +144,11 @@ class _Fit:
             found[:, channel] = strength
             squares = weight * np.stack([photo, left]) ** 2 / noise**2
             gain += float(squares[0].sum() - squares[1].sum())
-            before += float((squares[0] - weight)[there].sum())
-            after += float((squares[1] - weight)[there].sum())
-        share = 1 - max(after, 0.0) / before if before > 0 else 0.0
-        return cls(*found, gain, share)
+            explained += float((squares[0] - squares[1])[there].sum())
+            # where photos hardly differ there is nothing to explain
+            uneven += max(float((squares[0] - weight)[there].sum()), float(weight[there].sum()))
+        share = float(np.clip(explained / uneven, 0, 1)) if uneven > 0 else 0.0
+        return cls(found[0], found[1], gain, share)
 
 
 def find_reflection(

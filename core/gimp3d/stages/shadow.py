@@ -133,6 +133,8 @@ def find_shadow(
     strength[-1] -= DULL * strength[:-1].sum()
     tints = broad.tints(casts, strength)
     explained = broad.explained(casts @ strength, besides)
+    if explained < FAINT:
+        return "no shadow found: light is missing close to the object, as if in its shadow, but not round it"
     lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
     words = ", ".join(
         f"{light.strength.mean():.0%} of the light comes from {light.elevation:.0f}° above the surface"
