@@ -2,10 +2,10 @@
 
     python scripts/bench_light.py [DATA] [--draws 10] [--skip-removals] [--out build/bench_light]
 
-Three parts. Removals of scenes with a shadow, as `gimp3d` in a process of its own: shadow undone, left alone, and put
-into the hole where the truth marks it. Made scenes whose light is known (light_scenes.py). And scenes without a shadow,
-of which none must be found: each with several random draws of four views in five. Writes OUT/table.md and a sheet of
-pictures per scene. Run by `make bench-light`.
+Four parts. Removals of scenes with a shadow, as `gimp3d` in a process of its own: shadow undone, left alone, and put
+into the hole where the truth marks it. Made scenes whose light is known, and such whose floor is glossy
+(light_scenes.py). And scenes without a shadow, of which none must be found: each with several random draws of four
+views in five. Writes OUT/table.md and a sheet of pictures per scene. Run by `make bench-light`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from bench_raster import ROOT, machine, say, write
 from bench_real import gimp3d, remove_words, shadow_words
-from light_scenes import LitScene, shadowed_scenes, unshadowed_scenes
+from light_scenes import LitScene, glossy_scene, reflected, shadowed_scenes, unshadowed_scenes
 from pages import sheet, titled
 from real_scenes import Scene, read_scene
 
@@ -41,6 +41,7 @@ from gimp3d.srgb import linear
 SHADOWED = ("tiles_mug", "kitchen_monkey", "desk_shadow", "corner_shadow")
 CLEAR = ("desk", "corner", "gloss", "rocks", "real_table")
 DIFFERS = 0.04  # share of white by which photos with and without the shadow differ in it
+GLOSSY = (0.05, 0.1, 0.2, 0.4)  # share of light that comes back from a floor
 KEPT = 0.8  # of the views in a draw
 DARK = 4e-3  # of linear light, below which darkness is noise
 WAYS = {"undone": ["--shadow", "auto"], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}
@@ -68,6 +69,10 @@ def main() -> int:
     lines += ["", "| made scene | found | off by | darkening left | seconds |", "|---|---|---|---|---|"]
     for made in (*shadowed_scenes(), *unshadowed_scenes()):
         lines.append(row := known_light(made, given.out / "made"))
+        say(row)
+    lines += ["", "| glossy floor | found | in the reflection dB: left, undone | seconds |", "|---|---|---|---|"]
+    for strength in GLOSSY:
+        lines.append(row := known_reflection(strength, given.out / "made"))
         say(row)
     lines += ["", "| scene without a shadow | found in draws |", "|---|---|"]
     for name in CLEAR:
@@ -142,6 +147,26 @@ def known_light(made: LitScene, folder: Path) -> str:
     left = f"{np.concatenate(after).sum() / gone.sum():.0%}" if len(gone) and made.lamps else "–"
     degrees = ", ".join(f"{x:.1f}°" for x in off) or "–"
     return f"| {made.name} | {'yes' if result.shadow['found'] else 'no'} | {degrees} | {left} | {seconds:.1f} |"
+
+
+def known_reflection(strength: float, folder: Path) -> str:
+    made = glossy_scene(strength)
+    views = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()]
+    scores, rows = [], []
+    for way in ("off", "auto"):
+        start = time.perf_counter()
+        result = remove_object(made.gaussians, views, made.region, replace(PRESETS["balanced"], shadow=way))
+        seconds = time.perf_counter() - start
+        final = made.gaussians.take(result.keep)
+        final = final if result.added is None else final.extended(result.added)
+        drawn = {v.camera.id: render_bytes(final, v.camera) for v in views[::3]}
+        truth = {v.camera.id: render_bytes(made.truth, v.camera) for v in views[::3]}
+        where = {v.camera.id: reflected(made, v.camera) for v in views[::3]}
+        scores.append(np.mean([psnr(drawn[i], truth[i], where[i]) for i in drawn]))
+        rows += [titled(p, way) for i in drawn for p in (truth[i], drawn[i])]
+    write_png(folder / f"glossy_{strength:.2f}.png", sheet(rows, 4))
+    found = "yes" if result.reflection["found"] else "no"
+    return f"| {strength:.0%} comes back | {found} | {scores[0]:.1f}, {scores[1]:.1f} | {seconds:.1f} |"
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:

@@ -21,6 +21,7 @@ from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
+from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 from gimp3d.srgb import decoded, encoded
 
@@ -28,6 +29,7 @@ STEP = 0.025  # between splats
 RAYS = 64  # to a soft light
 WALL = 0.7  # x of the wall beside the block
 SIDE = 1.6  # half of the floor's
+DIFFERS = 8  # grey levels by which a reflection is seen
 
 
 @dataclass(frozen=True)
@@ -186,6 +188,14 @@ def glossy_scene(strength: float, lamps: Sequence[Lamp] = ()) -> LitScene:
     opacity = float(np.interp(1 - strength, alpha, tried))
     truth = seen_through(scene.truth, opacity).extended(sky)
     return replace(scene, gaussians=seen_through(scene.gaussians, opacity).extended(image).extended(sky), truth=truth)
+
+
+def reflected(scene: LitScene, camera: Camera) -> np.ndarray:
+    """[H, W] bool: where a view of a glossy scene differs from the truth, but does not show the block."""
+    block = cube(Box.make([0, 0, BLOCK / 2], [BLOCK] * 3), (1, 1, 1))
+    shown = render(block, camera, passes=frozenset({"rgb"})).alpha > 0.01
+    drawn, truth = (render_bytes(g, camera).astype(int) for g in (scene.gaussians, scene.truth))
+    return (np.abs(drawn - truth).max(-1) > DIFFERS) & ~shown
 
 
 def cube(box: Box, colour: tuple[float, float, float]) -> Gaussians:

@@ -187,8 +187,8 @@ def write_masks(
         proposed = json.dumps(found.proposed)
         write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
     if pictures:
-        shadow_facts = json.dumps(lit.shadow)
-        write_atomically(pictures / "shadow.json", lambda f: f.write(shadow_facts.encode()))
+        light = json.dumps({"shadow": lit.shadow, "reflection": lit.reflection})
+        write_atomically(pictures / "light.json", lambda f: f.write(light.encode()))
     if pictures and all(c.split == "train" for c in written):
         write_charts(pictures / "charts", charts)
     views = {v.camera.id: v for v in found.views}

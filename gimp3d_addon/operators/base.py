@@ -206,9 +206,12 @@ def python_of(context: bpy.types.Context) -> str:
 CLASSES = (GIMP3D_OT_cancel,)
 
 
-def shadow_words(found: dict[str, Any]) -> str:
-    """The shadow of a summary, in few words; empty where it was not looked for."""
-    if found["found"]:
-        light = ", ".join(f"{x['elevation']:.0f}° high" for x in found["lights"])
-        return f"Shadow undone{f' (light {light})' if light else ' as painted'}: {found['gaussians']:,} splats"
-    return "" if found["reason"] == "not looked for" else "No shadow of it is found"
+def light_words(shadow: dict[str, Any], reflection: dict[str, Any]) -> str:
+    """The shadow and the reflection of a summary, in few words; empty where they were not looked for."""
+    words = "No shadow of it is found"
+    if shadow["found"]:
+        light = ", ".join(f"{x['elevation']:.0f}° high" for x in shadow["lights"])
+        words = f"Shadow undone{f' (light {light})' if light else ' as painted'}"
+    elif shadow["reason"] == "not looked for":
+        words = ""
+    return f"{words}, reflection undone" if reflection["found"] else words

@@ -20,7 +20,7 @@ from gimp3d.job import RemovalJob
 
 from .. import backdrops, bridge, charts, jobs, splats
 from ..worker import Worker
-from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, python_of, shadow_words
+from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, light_words, python_of
 
 PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior", "shadow": "shadow"}
 VIEW = "view"  # ID of the one camera that is drawn
@@ -146,7 +146,8 @@ class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
         shown, pixels = mask, np.empty(4 * mask.size[0] * mask.size[1], np.float32)
         mask.pixels.foreach_get(pixels)
         context.scene.gimp3d.proposed = (folder / "pictures" / "proposed.json").read_text(encoding="utf-8")
-        context.scene.gimp3d.shadow_found = shadow_words(json.loads((folder / "pictures" / "shadow.json").read_bytes()))
+        facts = json.loads((folder / "pictures" / "light.json").read_bytes())
+        context.scene.gimp3d.shadow_found = light_words(facts["shadow"], facts["reflection"])
         context.scene.gimp3d.hole = f"{np.count_nonzero(pixels[::4] > 0.5):,} pixels in {self._camera}"
         for kind, title in PREVIEWS.items():
             drawn = folder / "pictures" / f"{self._stem}.{kind}.png"

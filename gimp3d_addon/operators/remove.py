@@ -15,7 +15,7 @@ from gimp3d.io.ply import read_ply
 from .. import charts, jobs, splats, steps
 from ..bridge import present
 from ..worker import Killed, Worker, duration
-from .base import RunsChild, current_boxes, current_splat, link, python_of, shadow_words
+from .base import RunsChild, current_boxes, current_splat, light_words, link, python_of
 
 SOURCE = "gimp3d_source"  # custom property of a result: the hidden object it came from
 
@@ -49,7 +49,7 @@ class RunsRemoval(RunsChild):
         report = self.folder / "report" / "index.html"
         settings.last_report = str(report) if report.exists() else ""
         settings.proposed = json.dumps(summary["proposed"])
-        settings.shadow_found = shadow_words(summary["shadow"])
+        settings.shadow_found = light_words(summary["shadow"], summary["reflection"])
         for warning in summary["warnings"]:
             self.report({"WARNING"}, warning)
         verdict = summary["verdict"] or {"score": 1.0, "words": []}

@@ -69,7 +69,7 @@ def test_masks_show_the_shadow_too(folder: Path, tmp_path: Path) -> None:
     words = ["--cameras", str(folder / "cams.json"), "--roi", str(folder / "roi.json"), "--images", "none"]
     options = ["--out", str(tmp_path / "m"), "--pictures", str(tmp_path / "p"), "--progress", "none"]
     assert main(["masks", str(folder / "scene.ply"), *words, *options]) == 0
-    assert json.loads((tmp_path / "p" / "shadow.json").read_text())["found"]
+    assert json.loads((tmp_path / "p" / "light.json").read_text())["shadow"]["found"]
     picture = read_image(next((tmp_path / "p").rglob("*.shadow.png")))
     assert picture.shape == (120, 3 * 160, 3)
 
