@@ -190,7 +190,7 @@ def find_planes(
     rng, left = np.random.default_rng(0), around
     found: list[tuple[float, Plane, _Round]] = []
     while len(found) < settings.most:
-        candidate = _largest_plane(left.points, left.weight, settings.inlier * diagonal, rng)
+        candidate = largest_plane(left.points, left.weight, settings.inlier * diagonal, rng)
         if candidate is None or left.weight[candidate[2]].sum() < settings.least * around.weight.sum():
             break
         point, normal, on = candidate
@@ -248,7 +248,7 @@ def extent(region: Region) -> float:
     return float(np.linalg.norm(region[0].size if len(region) == 1 else np.ptp(corners, axis=0)))
 
 
-def _largest_plane(
+def largest_plane(
     points: np.ndarray,  # [N, 3]
     weight: np.ndarray,  # [N]
     tolerance: float,

@@ -18,6 +18,7 @@ from .charts import (
     Plane,
     extent,
     facing_camera,
+    largest_plane,
     pixel_size,
     shown_there,
     surface_at,
@@ -25,6 +26,7 @@ from .charts import (
 )
 from .masks import ViewMasks
 from .mosaic import mosaic
+from .outline import surface_points
 from .witness import Says, Textures, Witness, ask
 
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
@@ -33,6 +35,10 @@ ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the 
 FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
 MIXED = 3.0  # … and pixels of the views that show the place best
+POINTS = 60_000  # of what views show, in which walls are sought …
+FLAT = 0.03  # … diagonals from a plane within which they lie on it …
+MUCH = 0.25  # … and the share of those that stand round the object that a wall holds
+SOLID = 0.9  # alpha from which a view shows a surface
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
 
 
@@ -58,9 +64,40 @@ class Ground:
 def look_at(
     planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
 ) -> list[Ground]:
-    """What photos show of the surfaces round the object, where they show enough."""
+    """What photos show of the surfaces round the object, where they show enough, and of walls beside it."""
+    planes = (*planes, *_walls(planes, views, witnesses, region))
     looked = (_look_at(plane, planes, views, witnesses, region) for plane in planes)
     return [ground for ground in looked if ground.known.sum() >= FEWEST]
+
+
+def _walls(
+    planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
+) -> list[Plane]:
+    """Planes beside the object, which it hides nowhere, that hold most of what stands round it."""
+    diagonal = extent(region)
+
+    def of(view: ViewMasks, witness: Witness) -> np.ndarray:
+        shown = np.where(witness.hidden | (view.alpha_before < SOLID) | view.occluder, 0, view.depth_before)
+        window = slice(0, view.camera.height), slice(0, view.camera.width)
+        step = max(1, round(math.sqrt((shown > 0).sum() * len(views) / POINTS)))
+        return surface_points(view.camera, shown, window, step)[2]
+
+    points = np.concatenate(parallel_map(lambda p: of(*p), list(zip(views, witnesses))))
+    points = points[(np.abs(points - planes[0].origin) < REACH * diagonal).all(1)]
+    for plane in planes:
+        points = points[plane.local(points)[:, 2] > FLAT * diagonal]
+    cameras, rng = np.array([v.camera.centre for v in views]), np.random.default_rng(0)
+    found: list[Plane] = []
+    least = MUCH * len(points)
+    while candidate := largest_plane(points, np.ones(len(points)), FLAT * diagonal, rng):
+        point, normal, on = candidate
+        if on.sum() < max(least, FEWEST):
+            break
+        points = points[~on]
+        if all(abs(normal @ other.normal) <= PARALLEL for other in (*planes, *found)):  # or it is a rough ground's haze
+            facing = normal if np.median((cameras - point) @ normal) > 0 else -normal
+            found.append(Plane.make(point, facing, region))
+    return found
 
 
 def _look_at(
