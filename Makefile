@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real bench-light extension \
+	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -70,6 +70,9 @@ bench-real: $(READY)
 
 bench-light: $(READY)
 	$(BIN)/python scripts/bench_light.py $(DATA)
+
+bench-light-rules: $(READY)
+	$(BIN)/python scripts/light_ablation.py $(DATA)
 
 # with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)

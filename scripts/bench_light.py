@@ -41,7 +41,7 @@ from gimp3d.srgb import linear
 SHADOWED = ("tiles_mug", "kitchen_monkey", "desk_shadow", "corner_shadow")
 CLEAR = ("desk", "corner", "gloss", "rocks", "real_table")
 DIFFERS = 0.04  # share of white by which photos with and without the shadow differ in it
-GLOSSY = (0.05, 0.1, 0.2, 0.4)  # share of light that comes back from a floor
+GLOSSY = (0.1, 0.2, 0.4)  # share of light that comes back from a floor
 KEPT = 0.8  # of the views in a draw
 DARK = 4e-3  # of linear light, below which darkness is noise
 WAYS = {"undone": ["--shadow", "auto"], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}

@@ -23,7 +23,7 @@ from bench_large import split
 from scipy.optimize import nnls
 
 from gimp3d import forecast
-from gimp3d.forecast import ROUND, ROUNDS, STEPS, forecast_removal
+from gimp3d.forecast import CHARTED, ROUND, ROUNDS, STEPS, forecast_removal
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 
@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "assets" / "demo"
 RUNS = (  # parts of each Gaussian, scale of the pictures, preset
     *((1, 1.0, "draft"), (1, 2.0, "draft"), (4, 1.0, "draft"), (2, 1.5, "balanced"), (1, 1.0, "balanced")),
-    *((1, 1.0, "best"), (3, 2.0, "best")),
+    *((1, 1.0, "best"), (3, 2.0, "best"), (1, 1.0, "paper"), (2, 1.5, "paper")),
 )
 
 
@@ -112,8 +112,10 @@ def measure(folder: Path, preset: str, work: Path) -> Run:
 
 def fitted(runs: list[Run]) -> dict[str, Any]:
     """The constants that forecast.py names, each stage's own."""
-    per_view = [[1.0, r.megapixels, r.millions * r.views] for r in runs]
-    first = {n: fit(per_view, [r.of_stage(n) for r in runs]) for n in ("read", "masks", *ROUND)}
+    first = {}
+    for name in ("read", "masks", *CHARTED[:-1], *ROUND, CHARTED[-1]):
+        had = [r for r in runs if name in r.stages and (r.preset in ROUNDS or name in ROUND[:2])]
+        first[name] = fit([[1.0, r.megapixels, r.millions * r.views] for r in had], [r.of_stage(name) for r in had])
     several = [r for r in runs if ROUNDS.get(r.preset, 1) > 1]
     basis = [[1.0, r.megapixels, r.millions * r.views] for r in several]
     further = {n: fit(basis, [r.further(n) for r in several]) for n in ROUND}

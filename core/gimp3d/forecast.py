@@ -1,6 +1,6 @@
 """What a removal will cost, told before it starts, and how far a running one is.
 
-The constants are written by scripts/calibrate_forecast.py, which measures them (4 cores, kernels compiled; the demo
+The constants are written by scripts/calibrate_forecast.py, which measures them (2 cores, kernels compiled; the demo
 scene with up to four times the Gaussians and pixels). Who runs removals multiplies by their own last run's pace.
 """
 
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # reference views completed, one after the other; others 1
+CHARTED = ("surfaces", "light", "lift", "charts", "verdict")  # stages of presets that know charts …
+ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # … which these are: charts and views completed one after the other
 ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
@@ -54,7 +55,9 @@ def forecast_removal(
 ) -> Forecast:
     """What a removal will roughly take; of what it finds to fill nothing is known yet, so all rounds count."""
     work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
-    stages = {name: _sum(cost, work) for name, cost in FIRST.items()}
+    known = preset in ROUNDS  # charts are completed without looking for a reference and its depth
+    other = ROUND[:2] if known else CHARTED
+    stages = {name: _sum(cost, work) for name, cost in FIRST.items() if name not in other}
     for round_ in range(2, 1 + ROUNDS.get(preset, 1)):
         stages |= {f"{name} {round_}": _sum(cost, work) for name, cost in FURTHER.items()}
     steps = STEPS.get(preset, 0)

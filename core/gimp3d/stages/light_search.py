@@ -15,8 +15,8 @@ from .ground import Ground
 from .occluder import Occluder
 
 DARK = 2e-3  # of linear light, noise of a photo's
-LEVELS = (2, 4, 8, 16)  # texels: sides of blocks whose luminance is compared …
-BROAD = (4, 8)  # … to tell how strong lights are: finer ones see edges, which no cast meets exactly
+LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of blocks whose luminance is compared …
+BROAD = (8, 16)  # … and of whole ones to tell how strong lights are: finer ones see edges, which no cast meets exactly
 DIRECTIONS = 384  # about 8° apart
 LOWEST = 8.0  # degrees above the support: light that comes from lower down is no light's
 SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried …

@@ -125,14 +125,16 @@ def find_shadow(
         )
     sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
     lights = [*scenery.settled(lights, [sky], FINEST), sky]
-    casts = scenery.casts(lights)
-    broad = Shading.make([r.surface for r in receivers], BROAD, bent=False)
+    fine = [Receiver.make(g) for g in grounds]
+    casts = replace(scenery, receivers=fine).casts(lights)
+    broad = Shading.make([r.surface for r in fine], BROAD, bent=False)
     # what comes from no light comes from the sky: wide shadows of that are hardly told from paint
     suns, skies = casts[:, :-1] - DULL * casts[:, -1:], casts[:, -1:]
-    strength, besides, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
+    strength, _, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
     strength[-1] -= DULL * strength[:-1].sum()
     tints = broad.tints(casts, strength)
-    explained = broad.explained(casts @ strength, besides)
+    coarse = scenery.casts(lights)
+    explained = scenery.lit.explained(coarse @ strength, scenery.lit.fit(coarse)[1])
     if explained < FAINT:
         return "no shadow found: light is missing close to the object, as if in its shadow, but not round it"
     lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
