@@ -23,7 +23,7 @@ from bench_large import split
 from scipy.optimize import nnls
 
 from gimp3d import forecast
-from gimp3d.forecast import CHARTED, ROUND, ROUNDS, STEPS, forecast_removal
+from gimp3d.forecast import CHARTED, ON_VIEWS, STAGES, STEPS, forecast_removal
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 
@@ -52,11 +52,6 @@ class Run:
 
     def of_stage(self, name: str) -> float:
         return self.stages.get(name, 0.0)
-
-    def further(self, name: str) -> float:
-        """A stage's mean over all the further rounds that the preset allows; most are not needed and take nothing."""
-        rounds = ROUNDS.get(self.preset, 1)
-        return sum(self.of_stage(f"{name} {k}") for k in range(2, rounds + 1)) / max(1, rounds - 1)
 
 
 def main() -> None:
@@ -112,26 +107,23 @@ def measure(folder: Path, preset: str, work: Path) -> Run:
 
 def fitted(runs: list[Run]) -> dict[str, Any]:
     """The constants that forecast.py names, each stage's own."""
-    first = {}
-    for name in ("read", "masks", *CHARTED[:-1], *ROUND, CHARTED[-1]):
-        had = [r for r in runs if name in r.stages and (r.preset in ROUNDS or name in ROUND[:2])]
-        first[name] = fit([[1.0, r.megapixels, r.millions * r.views] for r in had], [r.of_stage(name) for r in had])
-    several = [r for r in runs if ROUNDS.get(r.preset, 1) > 1]
-    basis = [[1.0, r.megapixels, r.millions * r.views] for r in several]
-    further = {n: fit(basis, [r.further(n) for r in several]) for n in ROUND}
-    stepped = [r for r in runs if STEPS.get(r.preset, 0)]
-    steps = [[STEPS[r.preset] * x for x in (1.0, r.megapixels / r.views)] for r in stepped]
-    memory = fit([[1.0, r.megapixels, r.millions] for r in runs], [r.memory_mb for r in runs], 0)
-    return {
-        "FIRST": first,
-        "FURTHER": further,
-        "PER_STEP": fit(steps, [r.of_stage("refine") for r in stepped], 5),
-        "MEMORY_MB": memory,
-    }
+    stages = {}
+    for name in STAGES:
+        had = [r for r in runs if name in r.stages and (r.preset in CHARTED or name in ON_VIEWS)]
+        stages[name] = fit([[1.0, r.megapixels, r.millions * r.views] for r in had], [r.of_stage(name) for r in had])
+    constants: dict[str, Any] = {"STAGES": stages}
+    for name, charted in (("STEP", True), ("PAPER_STEP", False)):
+        had = [r for r in runs if STEPS.get(r.preset, 0) and (r.preset in CHARTED) == charted]
+        steps = [[STEPS[r.preset] * x for x in (1.0, r.megapixels / r.views)] for r in had]
+        constants[name] = fit(steps, [r.of_stage("refine") for r in had], 5)
+    constants["MEMORY_MB"] = fit([[1.0, r.megapixels, r.millions] for r in runs], [r.memory_mb for r in runs], 0)
+    return constants
 
 
 def fit(features: list[list[float]], measured: list[float], decimals: int = 3) -> tuple[float, ...]:
-    """Non-negative coefficients; each run's relative error counts alike."""
+    """Non-negative coefficients; each run's relative error counts alike. None where no run had the stage."""
+    if not measured:
+        return (0.0, 0.0, 0.0)
     weights = 1 / np.maximum(measured, 0.05)
     solution, _ = nnls(np.array(features) * weights[:, None], np.array(measured) * weights)
     return tuple(round(float(v), decimals) for v in solution)

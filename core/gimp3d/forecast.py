@@ -8,36 +8,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-CHARTED = ("surfaces", "light", "lift", "charts", "verdict")  # stages of presets that know charts …
-ROUNDS = {"draft": 2, "balanced": 4, "best": 5}  # … which these are: charts and views completed one after the other
-ROUND = ("reference", "depth", "appearance", "mapping", "propagate", "seed")
+CHARTED = ("draft", "balanced", "best")  # presets that complete charts; others complete one view
+ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the former alone …
+ON_VIEWS = ("reference", "depth")  # … and of the latter
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
-FIRST = {
-    "read": (0.234, 0.081, 0.135),
-    "masks": (0.428, 0.099, 0.093),
-    "reference": (0.126, 0.009, 0.078),
-    "depth": (0.0, 0.032, 0.051),
-    "appearance": (0.088, 0.023, 0.018),
-    "mapping": (0.003, 0.03, 0.006),
-    "propagate": (0.184, 0.036, 0.073),
-    "seed": (0.053, 0.007, 0.018),
+STAGES = {
+    "read": (0.321, 0.129, 0.178),
+    "masks": (0.565, 0.159, 0.303),
+    "surfaces": (0.651, 0.047, 0.026),
+    "light": (1.677, 0.03, 0.0),
+    "lift": (0.0, 0.0, 0.0),
+    "charts": (0.215, 0.19, 0.133),
+    "reference": (0.391, 0.021, 0.0),
+    "depth": (0.311, 0.069, 0.0),
+    "appearance": (0.11, 0.004, 0.0),
+    "mapping": (0.026, 0.012, 0.001),
+    "propagate": (0.336, 0.069, 0.024),
+    "seed": (0.057, 0.022, 0.031),
+    "verdict": (0.274, 0.048, 0.044),
 }
-FURTHER = {
-    "reference": (0.0, 0.009, 0.019),
-    "depth": (0.0, 0.015, 0.005),
-    "appearance": (0.0, 0.007, 0.0),
-    "mapping": (0.0, 0.014, 0.009),
-    "propagate": (0.0, 0.008, 0.024),
-    "seed": (0.0, 0.008, 0.014),
-}
-PER_STEP = (0.0, 0.03323)  # s of refinement: constant, for each million pixels of a view
-MEMORY_MB = (208.0, 59.0, 795.0)  # constant, for each million pixels of all views, for each million Gaussians
+STEP = (0.00063, 0.04108)  # s of a step of refinement: constant, for each million pixels of a view
+PAPER_STEP = (0.00366, 0.11637)  # the same for the paper's, which move everything
+MEMORY_MB = (278.0, 71.0, 633.0)  # constant, for each million pixels of all views, for each million Gaussians
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Seconds of each stage in order (further rounds are `depth 2`, …), and the memory that is needed at once."""
+    """Seconds of each stage in order, and the memory that is needed at once."""
 
     stages: dict[str, float]
     memory_mb: float
@@ -53,16 +51,13 @@ def forecast_removal(
     pixels: int,  # of all views together
     preset: str = "balanced",
 ) -> Forecast:
-    """What a removal will roughly take; of what it finds to fill nothing is known yet, so all rounds count."""
+    """What a removal will roughly take: one chart, or one view, and a shadow that stays."""
     work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
-    known = preset in ROUNDS  # charts are completed without looking for a reference and its depth
-    other = ROUND[:2] if known else CHARTED
-    stages = {name: _sum(cost, work) for name, cost in FIRST.items() if name not in other}
-    for round_ in range(2, 1 + ROUNDS.get(preset, 1)):
-        stages |= {f"{name} {round_}": _sum(cost, work) for name, cost in FURTHER.items()}
-    steps = STEPS.get(preset, 0)
-    if steps:
-        stages["refine"] = steps * _sum(PER_STEP, (1.0, pixels / 1e6 / max(1, views)))
+    charted = preset in CHARTED
+    other = ON_VIEWS if charted else ON_CHARTS
+    stages = {name: _sum(cost, work) for name, cost in STAGES.items() if name not in other}
+    if steps := STEPS.get(preset, 0):
+        stages["refine"] = steps * _sum(STEP if charted else PAPER_STEP, (1.0, pixels / 1e6 / max(1, views)))
     memory_mb = _sum(MEMORY_MB, (1.0, pixels / 1e6, gaussians / 1e6))
     return Forecast(stages, memory_mb)
 
