@@ -27,9 +27,7 @@ Namespace = argparse.Namespace
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
 IMAGES = "photos; none: views are rendered from the scene"
 GROW = "take along what of the object the boxes cut off"
-SHADOW = (
-    "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
-)
+SHADOW = "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
 SHADOW_MASKS = "white pixels of DIR/<ID without extension>.png are the object's shadow (--shadow mask)"
 EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
 

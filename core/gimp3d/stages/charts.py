@@ -487,6 +487,7 @@ def surface_at(
     witnesses: Sequence[Witness],
     textures: Textures,
     settings: ChartSettings,
+    enough: float = math.inf,  # points that tell where a few texels lie, where views show more
 ) -> _Surface:
     """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
     flat = np.full((camera.height, camera.width), away, np.float32)
@@ -498,7 +499,7 @@ def surface_at(
         return _Surface(kind, depth, points, agreement, f"photos agree by {agreement:.2f}")
 
     level = at(0.0, "plane")
-    drawn = _drawn_surface(camera, flat, plane, views, witnesses, settings, extent(region))
+    drawn = _drawn_surface(camera, flat, plane, views, witnesses, settings, extent(region), enough)
     if drawn is None:
         return level
     relief = at(drawn.completed, "relief")
@@ -650,9 +651,10 @@ def _drawn_surface(
     witnesses: Sequence[Witness],
     settings: ChartSettings,
     diagonal: float,
+    enough: float,  # points of a cell
 ) -> _Drawn | None:
     """None where the views show too little of it."""
-    cells, enough = 2, 64  # px of a chart that share their points, and how many of those
+    cells = 2  # px of a chart that share their points
     h, w = -(-camera.height // cells), -(-camera.width // cells)
 
     ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)

@@ -31,6 +31,7 @@ from .witness import Says, Textures, Witness, ask
 
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
 DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
+ENOUGH = 64  # points that tell where a few texels lie
 ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
@@ -108,7 +109,8 @@ def _look_at(
     camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
     beside = max(BESIDE, math.ceil(MIXED * pixel_size(plane.origin, plane.normal, views) / texel))
     views, witnesses = zip(*parallel_map(lambda p: _shrunk(*p, plane.origin, texel), list(zip(views, witnesses))))
-    surface = surface_at(camera, away, plane, region, views, witnesses, Textures.make(witnesses), ChartSettings())
+    textures = Textures.make(witnesses)
+    surface = surface_at(camera, away, plane, region, views, witnesses, textures, ChartSettings(), ENOUGH)
     said = ask(witnesses, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
     image, spread = mosaic(surface.points, plane.normal, witnesses, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
