@@ -82,9 +82,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         type=bpy.types.Image, name="Painted shadow", description="A view with its shadow painted over, in any colour"
     )
     shadow_camera: PointerProperty(type=bpy.types.Object, name="Camera", description="The view of the painted shadow")
-    shadow_found: StringProperty(
-        name="Light", description="The shadow and reflection that were found last"
-    )
+    shadow_found: StringProperty(name="Light", description="The shadow and reflection that were found last")
     proposed: StringProperty(
         name="Proposed", description="What the box cut off, as the last preview or removal found it (JSON)"
     )
