@@ -35,7 +35,7 @@ ENOUGH = 64  # points that tell where a few texels lie
 ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
-MIXED = 3.0  # … and pixels of the views that show the place best
+BLURRED = 3.0  # … and pixels of the views that show the place best
 POINTS = 60_000  # of what views show, in which walls are sought …
 FLAT = 0.03  # … diagonals from a plane within which they lie on it …
 MUCH = 0.25  # … and the share of those that stand round the object that a wall holds
@@ -107,7 +107,7 @@ def _look_at(
     diagonal = extent(region)
     texel = diagonal / DENSITY
     camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
-    beside = max(BESIDE, math.ceil(MIXED * pixel_size(plane.origin, plane.normal, views) / texel))
+    beside = max(BESIDE, math.ceil(BLURRED * pixel_size(plane.origin, plane.normal, views) / texel))
     views, witnesses = zip(*parallel_map(lambda p: _shrunk(*p, plane.origin, texel), list(zip(views, witnesses))))
     textures = Textures.make(witnesses)
     surface = surface_at(camera, away, plane, region, views, witnesses, textures, ChartSettings(), ENOUGH)

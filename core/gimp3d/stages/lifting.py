@@ -28,7 +28,7 @@ DARKEST = 0.3  # share of light below which a photo holds too little texture to 
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 SAME = 0.05  # relative z up to which what is drawn nearer than an unknown ground is still that ground
-ROUGH = 0.1  # share of the ground that is drawn that much nearer, from which depths tell nothing
+UNRELIABLE = 0.1  # share of the ground that is drawn that much nearer, from which depths tell nothing
 MIXED = 0.75  # the same right beside the object, whose own colours, in the same pixels, would be lifted too
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
 COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
@@ -181,7 +181,7 @@ def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarra
     off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)
     before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
     proven = known & (off < ALIKE) & (hits.depth > 0)
-    rough = proven.any() and before[proven].mean() > ROUGH  # what is drawn before it says nothing here
+    rough = proven.any() and before[proven].mean() > UNRELIABLE  # what is drawn before it says nothing here
     is_it = np.where(known, proven, ~before | (hole & (rough | _mixed(witness)))) & (hits.depth > 0)
     return cv2.medianBlur(is_it.astype(np.uint8), PATCH) > 0  # highlights are specks
 
