@@ -18,9 +18,11 @@ from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
 from .poisson import solve_hole
+from .regularity import continue_regularly, find_motions
 from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
+OWN = 2  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
@@ -33,14 +35,13 @@ FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5
 class ExemplarSettings:
     """Lengths in pixels."""
 
-    patch: int = 5  # side, odd
+    patch: int = 13  # side, odd: smaller ones lose what is regular, such as tiles
     texture: float = 20.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
-    thickness: float = 8.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
+    thickness: float = 4.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
     smallest: int = 24  # no level is smaller
-    coarse_rounds: int = 6  # of matching and voting on the coarsest level
-    fewer_rounds: int = 3  # by which every finer level has fewer, down to one
+    coarse_rounds: int = 3  # of matching and voting on the coarsest level; finer ones have one
     sweeps: int = 2  # of PatchMatch per round
-    rim_trust: float = 5.0  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
+    rim_trust: float = 1.5  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
     settled: float = 0.3  # grey levels; a round that changes less ends its level
     reach: int = 4  # of the random search round the best source
     locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
@@ -62,7 +63,9 @@ def complete_picture(
     surface: Surface | None = None,  # what the picture shows
     unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
 ) -> Completion:
-    """Fill the hole so that every patch of it resembles one outside.
+    """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
+
+    What is unknown near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
 
     With a surface patches are compared and copied along its tangent planes, and what lies on another surface
     than the patch's centre, such as something that stands in front, is not compared.
@@ -70,31 +73,43 @@ def complete_picture(
     if not hole.any():
         return Completion(image.copy(), 0.0)
     radius = settings.patch // 2
-    if surface is not None:  # what is filled is mixed with nothing
-        surface = surface._replace(clear=surface.clear | hole)
+    asked, given = hole, image
     if unknown is None or not (unknown & ~hole).any() or (unknown | hole).all():
         unknown = np.zeros(hole.shape, bool)
-    else:  # they must say something where patches reach into them
+    if surface is None:
+        motions = find_motions(image, hole, ~hole & ~unknown)
+        image, regular = continue_regularly(image, hole, ~hole & ~unknown, motions)
+        hole = hole & ~regular
+        if not hole.any():
+            return Completion(image, max(m.misfit for m in motions))
+    if unknown.any():
+        reach = np.ones((2 * settings.patch + 1,) * 2, np.uint8)
+        hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), reach) > 0))
+        unknown = unknown & ~hole
         rows, cols = nearest_allowed(~(unknown | hole))
         image = np.where(unknown[..., None], image[rows, cols], image)
+    if surface is not None:  # what is filled is mixed with nothing
+        surface = surface._replace(clear=surface.clear | hole)
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
     if levels[-1][1].all():
-        return Completion(image.copy(), float("nan"))
+        return Completion(given.copy(), float("nan"))
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
         there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
         shape = open_.shape[::-1]
         barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
-        level = _prepared(channels, open_, barred, there, radius, settings)
-        rounds = max(1, settings.coarse_rounds - settings.fewer_rounds * number)
+        rounds = 1 if number else settings.coarse_rounds
+        finest = number == len(levels) - 1
+        level = _prepared(channels, open_, barred, there, radius, min(radius, OWN) if finest else radius, settings)
         colours, field = _filled(level, field, rounds, settings)
     assert field is not None
     sources = image[field.rows[hole], field.cols[hole]]
     misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
     filled = image.copy()
     filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
+    filled[~asked] = given[~asked]  # what was filled besides
     return Completion(filled, misfit)
 
 
@@ -110,6 +125,7 @@ class _Level:
     trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
     surface: Surface | None
     radius: int
+    reach: int  # px from its centre to which a patch votes
 
 
 def _prepared(
@@ -118,6 +134,7 @@ def _prepared(
     unknown: np.ndarray,
     surface: Surface | None,
     radius: int,
+    reach: int,
     settings: ExemplarSettings,
 ) -> _Level:
     touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
@@ -132,7 +149,7 @@ def _prepared(
         allowed = whole
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
     trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, touching, usable, allowed, trust, surface, radius)
+    return _Level(channels, hole, touching, usable, allowed, trust, surface, radius, reach)
 
 
 def _filled(
@@ -286,7 +303,7 @@ def _voted(
     weights = np.zeros(level.hole.shape)
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
     voted = otherwise.astype(np.float32)
-    parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius
+    parts = level.channels, places, *step, field.rows, field.cols, weights, level.reach
     if level.surface is None:
         run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
     else:
@@ -294,12 +311,23 @@ def _voted(
         number[level.touching] = np.arange(len(say))
         support = supports(level.surface, np.argwhere(level.touching), level.radius)
         warp = warps(level.surface, level.touching, field.rows, field.cols)
-        run_ranges(_vote_slanted, len(places), *parts, level.usable, number, support, warp, voted, chunk=VOTE_PIXELS)
+        run_ranges(
+            _vote_slanted,
+            len(places),
+            *parts,
+            level.radius,
+            level.usable,
+            number,
+            support,
+            warp,
+            voted,
+            chunk=VOTE_PIXELS,
+        )
     return voted
 
 
 @kernel
-def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
+def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, reach, voted):
     h, w, _ = channels.shape
     count, differs = voted.shape[1], dy + dx > 0
     sums = np.empty(count)
@@ -307,8 +335,8 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
         y, x = places[k]
         total = 0.0
         sums[:] = 0.0
-        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
-            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+        for a in range(max(0, y + dy - reach), min(h, y + reach + 1)):
+            for b in range(max(0, x + dx - reach), min(w, x + reach + 1)):
                 weight = weights[a, b]
                 if weight > 0.0:
                     v, u = rows[a, b] + y - a, cols[a, b] + x - b
@@ -326,7 +354,7 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
 
 @kernel
 def _vote_slanted(
-    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, number, support, warp, voted
+    lo, hi, channels, places, dy, dx, rows, cols, weights, reach, radius, usable, number, support, warp, voted
 ):  # fmt: skip
     """Only pixels on the surface of a patch's centre; colours between four pixels of which all may be copied."""
     h, w, _ = channels.shape
@@ -337,8 +365,8 @@ def _vote_slanted(
         y, x = places[k]
         total = 0.0
         sums[:] = 0.0
-        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
-            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
+        for a in range(max(0, y + dy - reach), min(h, y + reach + 1)):
+            for b in range(max(0, x + dx - reach), min(w, x + reach + 1)):
                 n, votes = number[a, b], weights[a, b] > 0.0
                 one[:] = 0.0
                 for end in range(ends):

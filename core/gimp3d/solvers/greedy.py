@@ -1,4 +1,4 @@
-"""A first guess for a hole: it is filled from its rim inwards, each time where most around is known."""
+"""A first guess for a hole: it is filled from its rim inwards, structure first."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numba import float32, int64
 
-from ..jit import kernel
+from ..jit import inline_kernel, kernel
 from ..raster.vec16 import fma16, load16, splat16, sum16
 from .patches import lay_out
 from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
@@ -14,11 +14,11 @@ from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surfac
 MOST_SOURCES = 4096  # patches that are tried for each place
 NO_SUPPORT = np.empty((0, 0), np.uint8)
 LEAST_SHARE = 1e-6  # what was copied without anything known around
-STAMP = 1  # px: half the square that is copied at once
+PLAIN = 0.03  # slope of colour per pixel, where no edge runs into the hole, by which a place counts nevertheless
 
 
 def fill_inwards(
-    channels: np.ndarray,  # [H, W, C] float32
+    channels: np.ndarray,  # [H, W, C] float32, colours first
     hole: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
     radius: int,
@@ -27,9 +27,10 @@ def fill_inwards(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.
 
-    The next place is the one with most known around it; what was copied counts as less known the further from
-    the rim it lies (confidence of Criminisi 2004). The source is the patch that differs least from what is
-    known of the place's own.
+    The next place is the one with most known around it where the strongest edges run into the hole (Criminisi 2004):
+    so edges are continued straight until they meet, before what lies between them is filled. What was copied counts
+    as less known the further from the rim it lies. The source is the patch that differs least from what is known of
+    the place's own.
     """
     patches = lay_out(channels, radius)
     rows, cols = np.nonzero(allowed)
@@ -49,6 +50,36 @@ def fill_inwards(
     return found_rows, found_cols
 
 
+@inline_kernel
+def _edge_into_hole(values, stride, channels, radius, known, y, x):
+    """How steep the strongest edge near a place of the rim is, times how straight it runs into the hole.
+
+    In the layout, where the patch at (y, x) begins, as `known` does.
+    """
+    size = 2 * radius + 1
+    steepest, along_x, along_y, inward_x, inward_y = float32(0), float32(0), float32(0), float32(0), float32(0)
+    for i in range(size):
+        for j in range(size):
+            if known[y + i, x + j] <= 0:
+                continue
+            inward_x -= j - radius
+            inward_y -= i - radius
+            if i + 1 == size or j + 1 == size or known[y + i + 1, x + j] <= 0 or known[y + i, x + j + 1] <= 0:
+                continue
+            here = (y + i) * stride + (x + j) * channels
+            slope_x, slope_y = float32(0), float32(0)
+            for c in range(3):
+                right = values[here + channels + c] - values[here + c]
+                down = values[here + stride + c] - values[here + c]
+                slope_x = right if abs(right) > abs(slope_x) else slope_x
+                slope_y = down if abs(down) > abs(slope_y) else slope_y
+            steep = slope_x * slope_x + slope_y * slope_y
+            if steep > steepest:
+                steepest, along_x, along_y = steep, -slope_y, slope_x
+    length = np.sqrt(inward_x * inward_x + inward_y * inward_y) + float32(1e-6)
+    return abs(along_x * inward_x + along_y * inward_y) / length
+
+
 @kernel
 def _fill_inwards(
     values, stride, channels, radius, row_weights, places, source_rows, source_cols, usable, known, share,
@@ -58,22 +89,36 @@ def _fill_inwards(
     h, w = rows.shape
     size, width = 2 * radius + 1, len(row_weights)
     weights = np.empty(size * width, np.float32)
+    edges = np.full((h, w), float32(-1))  # into the hole at places of its rim; negative: to be told anew
+    stamp = max(1, radius // 2)  # half the square that is copied at once
     left = len(places)
     while left > 0:
-        best_share, y, x = float32(-1), -1, -1
+        best, y, x = float32(-1), -1, -1
         for k in range(len(places)):
             a, b = places[k]
-            if rows[a, b] < 0 and share[a + radius, b + radius] > best_share:
-                best_share, y, x = share[a + radius, b + radius], a, b
+            if rows[a, b] >= 0:
+                continue
+            beside = False
+            for d in range(4):
+                v, u = a + radius + (d == 0) - (d == 1), b + radius + (d == 2) - (d == 3)
+                beside = beside or known[v, u] > 0
+            if beside and edges[a, b] < 0:
+                edges[a, b] = _edge_into_hole(values, stride, channels, radius, known, a, b)
+            priority = share[a + radius, b + radius] * (PLAIN + max(edges[a, b], float32(0)))
+            if not beside:
+                priority *= float32(1e-6)  # its turn comes only where the hole has no rim
+            if priority > best:
+                best, y, x = priority, a, b
         if slanted:  # only what lies on the place's own surface counts as known
             counted = float32(0)
             for i in range(size * size):
                 if support[number[y, x], i] != 0:
                     counted += known[y + i // size, x + i % size]
             counted /= size * size
-            if counted < 0.999 * best_share:
+            if counted < 0.999 * share[y + radius, x + radius]:
                 share[y + radius, x + radius] = counted
                 continue
+        best_share = share[y + radius, x + radius]
         for i in range(size):
             for j in range(width):
                 there = j < size * channels and known[y + i, x + j // channels] > 0
@@ -124,9 +169,8 @@ def _fill_inwards(
                 distance = sum16(total)
             if distance < least:
                 least, best_v, best_u = distance, v, u
-        reach = min(STAMP, radius)
-        for a in range(max(0, y - reach), min(h, y + reach + 1)):
-            for b in range(max(0, x - reach), min(w, x + reach + 1)):
+        for a in range(max(0, y - stamp), min(h, y + stamp + 1)):
+            for b in range(max(0, x - stamp), min(w, x + stamp + 1)):
                 if known[a + radius, b + radius] > 0:
                     continue
                 q, p = best_v + a - y, best_u + b - x
@@ -142,3 +186,6 @@ def _fill_inwards(
                 for i in range(size):
                     for j in range(size):
                         share[a + i, b + j] += max(best_share, LEAST_SHARE) / (size * size)
+        for a in range(max(0, y - radius - stamp), min(h, y + radius + stamp + 1)):
+            for b in range(max(0, x - radius - stamp), min(w, x + radius + stamp + 1)):
+                edges[a, b] = float32(-1)

@@ -1,0 +1,207 @@
+"""Motions that map a picture's surroundings of a hole onto themselves: lattices, rotations about a centre.
+
+What is regular is not invented: where a rigid motion of the picture explains nearly all of what is known round the
+hole, it also tells what is in it (offset statistics of He & Sun 2012, with rotations).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..threads import parallel_map
+
+SIDE = 96  # px: pictures are shrunk to this to find motions in
+ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms
+EXPLAINED = 0.97  # share of the surroundings' variance that a motion must explain
+OVERLAP = 0.75  # share of the surroundings that it must map to something known
+TOLD = 0.2  # share of the hole that it must tell
+CANDIDATES = 3  # translations that are looked at for every angle
+TRIED = 16  # motions that are followed up
+BAND = 0.75  # width of the surroundings, in thicknesses of the hole
+LEAST_BAND = 6  # px
+RIM, CONTRADICTED = 4, 0.01  # px beside the hole, and the share of them that may be quite unlike what they map to
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The pixel p = (row, col) looks like the pixel `turn` @ p + `shift`."""
+
+    turn: np.ndarray  # [2, 2]
+    shift: np.ndarray  # [2] px
+    explained: float  # share of the variance round the hole
+    misfit: float  # RMS grey levels of what is not explained
+
+
+def find_motions(
+    image: np.ndarray,  # [H, W, 3] uint8
+    hole: np.ndarray,  # [H, W] bool
+    known: np.ndarray,  # [H, W] bool, what the picture shows well
+) -> tuple[Motion, ...]:
+    """The motions that explain what is round the hole, best first; none in most pictures."""
+    scale = min(1.0, SIDE / max(hole.shape))
+    size = (max(1, round(hole.shape[1] * scale)), max(1, round(hole.shape[0] * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    there = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    open_ = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    band = _band(open_, there)
+    if not open_.any() or not band.any() or _variance(small, band) <= 0:
+        return ()
+    coarse = parallel_map(lambda angle: _of_angle(small, there, open_, band, angle), ANGLES)
+    ratio = np.array([hole.shape[0] / size[1], hole.shape[1] / size[0]])
+    picture, ring = image.astype(np.float32) / 255, _band(hole, known)
+    found = []
+    for _, angle, shift in sorted((c for of_angle in coarse for c in of_angle), key=lambda c: c[0])[:TRIED]:
+        turn = _turn(angle)
+        # centres of pixels lie at p + 1/2 in either resolution
+        full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
+        found.append((angle, full))
+    settled = parallel_map(lambda f: _settled(picture, known, hole, ring, *f), found)
+    return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
+
+
+def continue_regularly(
+    image: np.ndarray,  # [H, W, 3] uint8
+    hole: np.ndarray,  # [H, W] bool
+    known: np.ndarray,  # [H, W] bool
+    motions: tuple[Motion, ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """The picture with what motions tell of the hole, and which of its pixels [H, W] bool they tell of."""
+    filled, left = image.copy(), hole.copy()
+    for motion in motions:
+        rows, cols = np.nonzero(left)
+        if not len(rows):
+            break
+        y, x = _mapped(motion.turn, motion.shift, rows, cols)
+        tells = _sample(known.astype(np.float32), y, x) > 0.999
+        colours = _sample(image, y[tells], x[tells], cv2.INTER_CUBIC)
+        filled[rows[tells], cols[tells]] = colours
+        left[rows[tells], cols[tells]] = False
+    return filled, hole & ~left
+
+
+def _turn(angle: float) -> np.ndarray:
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    return np.array([[c, -s], [s, c]])
+
+
+def _band(hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[H, W] bool: what is known round the hole."""
+    thickness = float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max(initial=0))
+    far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    return known & (far <= max(LEAST_BAND, 2 * BAND * thickness))
+
+
+def _variance(image: np.ndarray, where: np.ndarray) -> float:
+    return float(image[where].var(0).sum())
+
+
+def _of_angle(
+    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float
+) -> list[tuple[float, float, np.ndarray]]:
+    """(cost, angle, shift) of the translations after this turn under which most of the band is like what it is mapped to.
+
+    Sums of squared differences over what both sides know, for all translations at once (Fourier transforms).
+    """
+    import scipy.fft  # slow to import, and many removals fill no picture
+
+    h, w = hole.shape
+    side = (h, w) if angle == 0 else (math.ceil(math.hypot(h, w)),) * 2
+    turn = _turn(angle)
+    middle = np.array([h - 1, w - 1]) / 2 - turn @ (np.array(side) - 1) / 2  # turned pixel z shows turn @ z + middle
+    matrix = np.array([[turn[1, 1], turn[1, 0], middle[1]], [turn[0, 1], turn[0, 0], middle[0]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned = cv2.warpAffine(image, matrix, side[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    shown = cv2.warpAffine(known.astype(np.float32), matrix, side[::-1], flags=flags) > 0.999
+    shape = tuple(scipy.fft.next_fast_len(a + b, real=True) for a, b in zip((h, w), side))
+
+    def spectrum(a: np.ndarray) -> np.ndarray:
+        return scipy.fft.rfft2(a, shape, axes=(0, 1))
+
+    def correlated(*pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        return scipy.fft.irfft2(sum(np.conj(a) * b for a, b in pairs), shape)
+
+    here, there = band.astype(np.float32), shown.astype(np.float32)
+    of_there, of_here = spectrum(there), spectrum(here)
+    squares = spectrum((image**2).sum(-1) * here), spectrum((turned**2).sum(-1) * there)
+    products = np.conj(spectrum(image * here[..., None])) * spectrum(turned * there[..., None])
+    overlap = correlated((of_here, of_there))
+    differs = correlated((squares[0], of_there), (of_here, squares[1])) - 2 * scipy.fft.irfft2(products.sum(-1), shape)
+    tells = correlated((spectrum(hole.astype(np.float32)), of_there))
+    allowed = (overlap >= OVERLAP * band.sum()) & (tells >= TOLD * hole.sum())
+    score = np.where(allowed, differs / np.maximum(overlap, 1), np.inf)
+    limit = 2 * _variance(image, band)
+    found = []
+    for _ in range(CANDIDATES):
+        v, u = np.unravel_index(int(score.argmin()), score.shape)
+        if not score[v, u] < 0.5 * limit:  # pictures are settled finely later, and explain more then
+            break
+        moved = np.array([v - shape[0] if v >= side[0] else v, u - shape[1] if u >= side[1] else u])
+        found.append((float(score[v, u]), angle, turn @ moved + middle))
+        rows, cols = (np.arange(at - 2, at + 3) % n for at, n in zip((v, u), score.shape))
+        score[np.ix_(rows, cols)] = np.inf
+    return found
+
+
+def _settled(
+    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float, shift: np.ndarray
+) -> Motion | None:
+    """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; turns are about the hole."""
+    ring, inside = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000)))
+    rim = np.nonzero(known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0))
+    shows, total = known.astype(np.float32), 2 * _variance(image, band)
+    middle = np.argwhere(hole).mean(0)
+    target = _turn(angle) @ middle + shift
+
+    def at(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turn = _turn(angle + values[0])
+        return turn, target + values[1:] - turn @ middle
+
+    def unexplained(values: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Of the pixels that are mapped to something known, over the variance of the surroundings."""
+        y, x = _mapped(*at(values), rows, cols)
+        both = _sample(shows, y, x) > 0.999
+        return ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1) / total
+
+    def explained(values: np.ndarray) -> float:
+        rest = unexplained(values, *ring)
+        return 1 - float(rest.mean()) if len(rest) >= max(1, OVERLAP * len(ring[0])) else -np.inf
+
+    values, step = np.zeros(3), 1.0
+    best = explained(values)
+    while step > 0.1:
+        moves = [values + step * sign * np.eye(3)[k] for k in range(0 if angle else 1, 3) for sign in (1, -1)]
+        told = [explained(m) for m in moves]
+        if max(told) > best:
+            values, best = moves[int(np.argmax(told))], max(told)
+        else:
+            step /= 2
+    y, x = _mapped(*at(values), *inside)
+    tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
+    # where something ends at the hole, only its rim contradicts
+    contradicted = unexplained(values, *rim) > 0.5
+    if not tells or best < EXPLAINED or contradicted.sum() > CONTRADICTED * len(contradicted):
+        return None
+    return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * total / 3))
+
+
+def _thinned(where: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    rows, cols = np.nonzero(where)
+    step = max(1, -(-len(rows) // most))
+    return rows[::step], cols[::step]
+
+
+def _mapped(turn: np.ndarray, shift: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    y = turn[0, 0] * rows + turn[0, 1] * cols + shift[0]
+    x = turn[1, 0] * rows + turn[1, 1] * cols + shift[1]
+    return y.astype(np.float32), x.astype(np.float32)
+
+
+def _sample(picture: np.ndarray, y: np.ndarray, x: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Values [N, ...] at places of a picture, 0 outside."""
+    if not len(y):
+        return np.zeros((0, *picture.shape[2:]), picture.dtype)
+    return cv2.remap(picture, x[None], y[None], how, borderMode=cv2.BORDER_CONSTANT)[0]
