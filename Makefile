@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules extension \
+	bench-harmonics bench-nnf bench-inpaint bench-fill bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -104,6 +104,10 @@ bench-nnf: $(READY) $(OTHERS)/.ready
 
 bench-inpaint: $(READY) $(OTHERS)/.ready
 	$(BIN)/python scripts/bench_inpaint.py --others $(OTHERS)/bin/python
+
+# the built-in fill beside the true picture given, and beside other programs on pictures with structure: ten minutes
+bench-fill: $(READY) $(OTHERS)/.ready
+	$(BIN)/python scripts/bench_fill.py $(DATA) --others $(OTHERS)/bin/python
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py

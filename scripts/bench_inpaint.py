@@ -67,8 +67,8 @@ def main() -> int:
             pictures = dict(list(pictures.items())[:2])
         strips = []
         for name, picture in pictures.items():
-            fills = completed(options.others, picture, name, missing)
             hole = blob(*picture.shape[:2], seed=len(name))
+            fills = completed(options.others, picture, name, missing, hole)
             for method, (filled, seconds) in fills.items():
                 found = {"size": "1080p" if large else "512", "picture": name, "method": method, "s": seconds}
                 rows.append(found | scores(filled, picture, hole))
@@ -83,10 +83,9 @@ def main() -> int:
 
 
 def completed(
-    others: Path, picture: np.ndarray, name: str, missing: dict[str, str]
+    others: Path, picture: np.ndarray, name: str, missing: dict[str, str], hole: np.ndarray
 ) -> dict[str, tuple[np.ndarray, float]]:
     """Method → filled picture and CPU seconds."""
-    hole = blob(*picture.shape[:2], seed=len(name))
     holed = np.where(hole[..., None], np.uint8(0), picture)
     fills = {}
     runs = {OURS: lambda: complete_picture(holed, hole).image}

@@ -22,7 +22,7 @@ from .regularity import continue_regularly, find_motions
 from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-OWN = 2  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in
+OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
@@ -74,20 +74,20 @@ def complete_picture(
         return Completion(image.copy(), 0.0)
     radius = settings.patch // 2
     asked, given = hole, image
-    if unknown is None or not (unknown & ~hole).any() or (unknown | hole).all():
+    if unknown is None or (unknown | hole).all():
         unknown = np.zeros(hole.shape, bool)
+    known = ~(hole | unknown)
+    rows, cols = nearest_allowed(known)
+    image = np.where(known[..., None], image, image[rows, cols])  # what stood there means nothing
     if surface is None:
-        motions = find_motions(image, hole, ~hole & ~unknown)
-        image, regular = continue_regularly(image, hole, ~hole & ~unknown, motions)
+        motions = find_motions(image, hole, known)
+        image, regular = continue_regularly(image, hole, known, motions)
+        if (regular == hole).all():
+            return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
         hole = hole & ~regular
-        if not hole.any():
-            return Completion(image, max(m.misfit for m in motions))
-    if unknown.any():
-        reach = np.ones((2 * settings.patch + 1,) * 2, np.uint8)
-        hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), reach) > 0))
-        unknown = unknown & ~hole
-        rows, cols = nearest_allowed(~(unknown | hole))
-        image = np.where(unknown[..., None], image[rows, cols], image)
+    reach = np.ones((2 * settings.patch + 1,) * 2, np.uint8)
+    hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), reach) > 0))
+    unknown = unknown & ~hole
     if surface is not None:  # what is filled is mixed with nothing
         surface = surface._replace(clear=surface.clear | hole)
     levels = _pyramid(image, hole, radius, settings)

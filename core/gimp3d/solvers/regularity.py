@@ -23,6 +23,7 @@ CANDIDATES = 3  # translations that are looked at for every angle
 TRIED = 16  # motions that are followed up
 BAND = 0.75  # width of the surroundings, in thicknesses of the hole
 LEAST_BAND = 6  # px
+PLAIN = 3 * 255.0**-2  # variance of the surroundings, one grey level in each channel, below which nothing is regular
 RIM, CONTRADICTED = 4, 0.01  # px beside the hole, and the share of them that may be quite unlike what they map to
 
 
@@ -48,7 +49,7 @@ def find_motions(
     there = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     open_ = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
     band = _band(open_, there)
-    if not open_.any() or not band.any() or _variance(small, band) <= 0:
+    if not open_.any() or not band.any() or _variance(small, band) < PLAIN:
         return ()
     coarse = parallel_map(lambda angle: _of_angle(small, there, open_, band, angle), ANGLES)
     ratio = np.array([hole.shape[0] / size[1], hole.shape[1] / size[0]])
@@ -102,7 +103,7 @@ def _variance(image: np.ndarray, where: np.ndarray) -> float:
 def _of_angle(
     image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float
 ) -> list[tuple[float, float, np.ndarray]]:
-    """(cost, angle, shift) of the translations after this turn under which most of the band is like what it is mapped to.
+    """(cost, angle, shift) of the translations after this turn under which the band is most like what it is mapped to.
 
     Sums of squared differences over what both sides know, for all translations at once (Fourier transforms).
     """
@@ -149,7 +150,7 @@ def _of_angle(
 def _settled(
     image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float, shift: np.ndarray
 ) -> Motion | None:
-    """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; turns are about the hole."""
+    """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; it turns about the hole."""
     ring, inside = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000)))
     rim = np.nonzero(known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0))
     shows, total = known.astype(np.float32), 2 * _variance(image, band)

@@ -1,0 +1,48 @@
+"""Structure runs on through a hole: edges, corners, rows; and what is unknown beside it has no say."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gimp3d.evaluate.metrics import psnr
+from gimp3d.solvers.exemplar import ExemplarSettings, complete_picture
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "scripts"))
+from structured import edge_error, structured
+
+PICTURES = structured()
+
+
+def filled(name: str, seed: int = 0) -> np.ndarray:
+    truth, hole = PICTURES[name]
+    return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, ExemplarSettings(seed=seed)).image
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_edges_are_continued_within_two_pixels(name: str) -> None:
+    assert edge_error(filled(name), *PICTURES[name]) < 2
+
+
+@pytest.mark.parametrize("name", ["bricks", "two mats and wood"])
+def test_the_seed_hardly_matters(name: str) -> None:
+    truth, hole = PICTURES[name]
+    assert np.std([psnr(filled(name, seed), truth, hole) for seed in range(4)]) < 0.5
+
+
+def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
+    truth, hole = PICTURES["two mats and wood"]
+    unknown = np.zeros_like(hole)
+    unknown[60:110, 60:72] = True
+    unknown &= ~hole
+    fills = []
+    for rubbish in (0, 255):
+        picture = np.where((hole | unknown)[..., None], np.uint8(rubbish), truth)
+        done = complete_picture(picture, hole, unknown=unknown).image
+        assert (done[~hole] == picture[~hole]).all()
+        fills.append(done[hole])
+    assert (fills[0] == fills[1]).all()
+    assert edge_error(np.where(hole[..., None], done, truth), truth, hole) < 2

@@ -1,0 +1,60 @@
+"""What is regular is continued by the motion that explains it; what is not, is not taken for regular."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gimp3d.solvers.regularity import continue_regularly, find_motions
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "scripts"))
+from structured import structured
+
+PICTURES = structured()
+
+
+def told(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(truth, what was made of the picture, which pixels motions tell of)."""
+    truth, hole = PICTURES[name]
+    holed = np.where(hole[..., None], np.uint8(0), truth)
+    motions = find_motions(holed, hole, ~hole)
+    return truth, *continue_regularly(holed, hole, ~hole, motions)
+
+
+@pytest.mark.parametrize("name", ["checker", "stripes ending", "curved edge", "step"])
+def test_lattices_and_turns_tell_the_whole_hole(name: str) -> None:
+    truth, filled, regular = told(name)
+    assert (regular == PICTURES[name][1]).all()
+    off = np.abs(filled[regular].astype(float) - truth[regular]).mean(-1)
+    assert np.median(off) < 4  # the grain of the picture
+    assert (off > 30).mean() < 0.02  # no edge in another place
+
+
+def test_arms_of_a_flower_are_turned_into_place() -> None:
+    truth, filled, regular = told("rug")
+    assert 0.2 < regular.sum() / PICTURES["rug"][1].sum() < 1  # its middle is seen nowhere
+    assert np.median(np.abs(filled[regular].astype(float) - truth[regular])) < 4
+
+
+@pytest.mark.parametrize("name", ["corner", "book row", "two mats and wood"])
+def test_what_has_no_counterpart_is_left_to_others(name: str) -> None:
+    assert not told(name)[2].any()
+
+
+@pytest.mark.parametrize("strength", [0, 1, 60])
+def test_noise_and_plain_pictures_are_not_regular(strength: int) -> None:
+    random = np.random.default_rng(3)
+    picture = np.clip(128 + strength * random.normal(size=(90, 120, 3)), 0, 255).astype(np.uint8)
+    hole = np.zeros((90, 120), bool)
+    hole[30:60, 40:75] = True
+    assert find_motions(picture, hole, ~hole) == ()
+
+
+def test_a_hole_without_surroundings_has_no_motions() -> None:
+    hole = np.ones((40, 50), bool)
+    picture = np.zeros((40, 50, 3), np.uint8)
+    assert find_motions(picture, hole, ~hole) == ()
+    assert not continue_regularly(picture, hole, ~hole, ())[1].any()
