@@ -127,7 +127,7 @@ def test_an_empty_hole_is_a_no_op_and_a_full_one_is_refused(spec: str) -> None:
 
 @pytest.mark.parametrize("spec", ["", "lama", "exemplar:3", "file", "file:", "command:", "onnx:"])
 def test_unknown_providers_are_refused_with_the_choices(spec: str) -> None:
-    choices = "exemplar, telea, ns, shiftmap, fsr, file:PATH, onnx:PATH or command:CMD"
+    choices = "exemplar, telea, ns, shiftmap, fsr, file:PATH, onnx:PATH, torchscript:PATH"
     refuse(choices, spec, scenery(), disc())
 
 
