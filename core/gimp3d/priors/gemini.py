@@ -31,7 +31,8 @@ SIZES = {
     "21:9": (1536, 672),
 }
 DOLLARS = {"gemini-2.5-flash-image": 0.039, "gemini-3.1-flash-image-preview": 0.067}  # a picture, by Google's list
-ATTEMPTS = 3  # of a request that the server is too busy for; by the client, with growing pauses
+ATTEMPTS = 3  # of a request that the server is too busy for; by the client
+PAUSE = 1.0  # s before the second one, longer before the third
 HIDDEN = (255, 0, 255)  # the colour that covers the hole
 LEFT = 0.1  # share of the hole that may be of nearly that colour in the answer
 NEARLY = 40  # grey levels in each channel
@@ -115,7 +116,8 @@ def _asked(who: str, model: str, key: str, pictures: list[bytes], aspect: str, s
     words = PROMPT + (f" The covered area shows: {call.prompt}." if call.prompt else "")
     contents: list[Any] = [types.Part.from_bytes(data=data, mime_type="image/png") for data in pictures]
     options = types.HttpOptions(
-        timeout=int(1000 * call.seconds), retry_options=types.HttpRetryOptions(attempts=ATTEMPTS, initial_delay=1.0)
+        timeout=int(1000 * call.seconds),
+        retry_options=types.HttpRetryOptions(attempts=ATTEMPTS, initial_delay=PAUSE, jitter=PAUSE),
     )
     config = types.GenerateContentConfig(
         response_modalities=["IMAGE"],

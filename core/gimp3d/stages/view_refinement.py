@@ -26,7 +26,7 @@ LONGEST = 1024  # px of a panel's longer side; larger ones are reduced
 COARSE = (
     4.0  # px, σ of the blur under which the answer is compared with the painting: texture may change, structure not
 )
-MOST_DRIFT = 20.0  # grey levels, mean under that blur; see docs/painters.md for what it was measured on
+MOST_DRIFT = 17.0  # grey levels, mean under that blur: true views are at most 15 from their painting, the object 20 and more
 
 
 @dataclass(frozen=True)
