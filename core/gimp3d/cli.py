@@ -266,7 +266,8 @@ def _masks(given: Namespace, shown: Reporter) -> None:
 
 
 def _remove(given: Namespace, shown: Reporter) -> None:
-    from .commands import run_removal
+    from .commands import job_settings, run_removal
+    from .pipeline import provider_notices
 
     folder = Path(given.job) if given.job else None
     if folder and given.scene is None:
@@ -286,6 +287,8 @@ def _remove(given: Namespace, shown: Reporter) -> None:
         if folder:
             save_job(folder, job)
     start = time.perf_counter()
+    for notice in provider_notices(job_settings(job), given.allow_network):
+        print(f"gimp3d: note: {notice}", file=sys.stderr)
     summary = run_removal(job, folder, given.resume, shown, given.allow_network)
     shown.done(summary)
     if not given.quiet and given.progress == "bar":

@@ -260,7 +260,8 @@ def remove_object(
         If the task has no defined answer, with the reason.
     """
     run = _Run(store, progress, allow_network)
-    _check_providers(run, settings)
+    for notice in provider_notices(settings, allow_network):
+        progress("read", 0, 1, notice)
     photos = {v.camera.id: v.image for v in views}
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
@@ -394,8 +395,15 @@ def remove_object(
     return lit.with_changes(result, unlit)
 
 
-def _check_providers(run: _Run, settings: RemovalSettings) -> None:
-    """Refuse now what would fail after minutes, and say what is sent where and what it costs before it is."""
+def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
+    """What providers send where and what that costs, to be said before they do.
+
+    Raises
+    ------
+    BadInput
+        If a provider would fail after minutes: it is unknown, lacks a file or a library, or is not allowed.
+    """
+    run = _Run(None, silent, allow_network)
     notices = [check_provider(settings.inpaint, run.call("--inpaint", "read", settings))]
     check_depth_prior(settings.depth_prior, run.call("--depth-prior", "read", settings))
     if settings.refine_views:
@@ -404,8 +412,7 @@ def _check_providers(run: _Run, settings: RemovalSettings) -> None:
         if settings.refine_views.partition(":")[0] not in REFINERS:
             raise BadInput(f"--refine-views: unknown provider {settings.refine_views!r}; use http://… or command:CMD")
         notices.append(painter(settings.refine_views, run.call("--refine-views", "read", settings)).notice)
-    for notice in filter(None, notices):
-        run.progress("read", 0, 1, notice)
+    return [notice for notice in notices if notice]
 
 
 def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:

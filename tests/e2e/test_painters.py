@@ -91,8 +91,6 @@ def servers(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, StandIn]]:
 def asks_only(scene_: Any, views: Any, region: Any, settings: RemovalSettings, *rest: Any) -> RemovalResult:
     """In a removal's place: its providers are asked about a picture, as it would."""
     network = rest[-1]
-    run = pipeline._Run(None, rest[2], network)
-    pipeline._check_providers(run, settings)
     picture, hole = scenery(), disc()
     facts: dict[str, Any] = {}
     call = Call("--inpaint", "appearance", rest[2], 60, network, settings.prompt)
@@ -275,5 +273,7 @@ def test_what_leaves_the_machine_is_said_before(tmp_path: Path, monkeypatch: pyt
     folder = write_scene(tmp_path, 2)
     arguments = ("--inpaint", "http://192.0.2.7:8188", "--allow-network", "--progress", "json")
     assert remove(folder, *arguments) == 130
-    said = [json.loads(line)["message"] for line in capsys.readouterr().out.splitlines()]
-    assert "pictures of the scene are sent to 192.0.2.7:8188" in said
+    found = capsys.readouterr()
+    notice = "pictures of the scene are sent to 192.0.2.7:8188"
+    assert found.err.startswith(f"gimp3d: note: {notice}\n")
+    assert notice in [json.loads(line)["message"] for line in found.out.splitlines() if '"message"' in line]

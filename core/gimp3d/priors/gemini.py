@@ -93,8 +93,8 @@ def painter(model: str, call: Call) -> Painter:
         top, _, left, _ = padding
         return scaled(answer, *wide)[top : top + h, left : left + w]
 
-    price = f"about ${DOLLARS[model]:.2f}" if model in DOLLARS else "its price in Google's list"
-    notice = f"pictures of the scene are sent to Google's {model}; each costs {price}"
+    price = f"about ${DOLLARS[model]:.2f} each" if model in DOLLARS else "its price in Google's list each"
+    notice = f"pictures of the scene are sent to Google's {model}, usually one or two a removal, {price}"
     return Painter(model, paint, f"the picture that {model} painted", notice=notice)
 
 

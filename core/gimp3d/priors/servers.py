@@ -14,7 +14,7 @@ import urllib.request
 import uuid
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from http.client import HTTPException
 from importlib import resources
 from pathlib import Path
@@ -111,7 +111,8 @@ class _Server:
             raise BadInput(f"{call.option} http: {url!r} is no address ({error})") from None
         self.option = f"{call.option} {parts.scheme}"
         if not host or parts.username is not None or parts.query or parts.fragment:
-            raise BadInput(f"{self.option}: {url!r} is no server's address; give http://127.0.0.1:8188 or alike")
+            shown = f"{parts.scheme}://{host}" if host else url  # without a password
+            raise BadInput(f"{self.option}: {shown} is no server's address; give http://127.0.0.1:8188 or alike")
         self.host = f"{host}:{port}" if port else host
         self.url, self.local, self.seconds = url.rstrip("/"), is_local(host), call.seconds
         if not self.local and not call.allow_network:
@@ -211,7 +212,8 @@ class _Comfy:
     server: _Server
     workflow: dict[str, Any] | None  # None: the one that comes with this program
     prompt_id: str = ""
-    doing: str = field(default="gets the picture")
+    doing: str = "gets the picture"
+    stopped: bool = False
 
     def paint(self, asked: _Asked) -> bytes:
         server = self.server
@@ -229,12 +231,13 @@ class _Comfy:
         if not isinstance(answer, dict) or "prompt_id" not in answer:
             server.misunderstood(json.dumps(answer))
         self.prompt_id = str(answer["prompt_id"])
-        while True:
+        while not self.stopped:
             history = server.get(f"/history/{self.prompt_id}")
             if self.prompt_id in history:
                 return self._picture(history[self.prompt_id])
             self.doing = "paints" if self._is_running() else "has others to paint first"
             time.sleep(POLL)
+        raise BadInput(f"{server.option}: stopped")  # nobody waits for it any longer
 
     def _checkpoint(self, wanted: str) -> str:
         """The model that is named, else the first one for inpainting, else the first one."""
@@ -274,6 +277,7 @@ class _Comfy:
 
     def stop(self) -> None:
         """Take our prompt out of the queue; interrupt only if it is ours that is painted."""
+        self.stopped = True
         if not self.prompt_id:
             return
         with suppress(BadInput, AttributeError):

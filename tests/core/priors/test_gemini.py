@@ -109,7 +109,8 @@ def test_what_it_costs_is_said_before(google: Gemini) -> None:
         said.append(f"{message} ({len(google.asked)} asked)")
 
     notice = check_provider("gemini", ONLINE)
-    assert notice == "pictures of the scene are sent to Google's gemini-2.5-flash-image; each costs about $0.04"
+    assert notice.startswith("pictures of the scene are sent to Google's gemini-2.5-flash-image, ")
+    assert notice.endswith("one or two a removal, about $0.04 each")
     assert "its price in Google's list" in check_provider("gemini:another", ONLINE)
     inpaint_reference("gemini", scenery(), disc(), call=Call(progress=progress, allow_network=True))
     assert said[0] == f"{notice} (0 asked)"

@@ -246,8 +246,7 @@ def test_local_servers_are_not_asked_through_a_proxy(comfy: Comfy, monkeypatch: 
 @pytest.mark.parametrize("spec", ["http://", "http:/127.0.0.1", "http://me:secret@127.0.0.1:1", "http://127.0.0.1:x",
                                   "http://127.0.0.1:99999", "http://[::1", "http://127.0.0.1/?a=b"])  # fmt: skip
 def test_addresses_that_are_none_are_refused(spec: str) -> None:
-    said = refuse("is no server's address|is no address", spec, scenery(), disc())
-    assert "secret" not in said or "me:secret@" in spec
+    assert "secret" not in refuse("is no server's address|is no address", spec, scenery(), disc())
 
 
 @pytest.mark.parametrize(("width", "height"), [(160, 120), (1, 1), (4000, 300), (900, 700), (3000, 2990)])
