@@ -479,19 +479,27 @@ def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
             digest.update(Path(path).read_bytes())
-    for provider in filter(None, (job.inpaint, job.depth_prior, job.refine_views)):
-        path, last = provider.partition(":")[2], provider.rpartition(",")[2]  # a workflow comes last
-        while path and not Path(path).is_file():  # options follow a file's name after commas
-            path = path.rpartition(",")[0]
-        for file in {path, last if last != provider else ""}:
-            if file and Path(file).is_file():
-                digest.update(Path(file).read_bytes())
+    for provider in (job.inpaint, job.depth_prior, job.refine_views or ""):
+        for file in _files_of(provider):
+            digest.update(file.read_bytes())
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
         digest.update(view.image.tobytes())
         for mark in marks:
             digest.update(mark[view.camera.id].tobytes() if view.camera.id in mark else b"none")
     return digest.hexdigest()
+
+
+def _files_of(provider: str) -> list[Path]:
+    """The files that a provider names: a model or picture, options after commas, or a server's workflow after one."""
+    name, _, rest = provider.partition(":")
+    if name == "command":
+        return []
+    if name in ("http", "https"):
+        rest = rest.partition(",")[2]
+    parts = rest.split(",")
+    named = (Path(",".join(parts[:k])) for k in range(len(parts), 0, -1))
+    return [path for path in named if path.is_file()][:1]
 
 
 def to_bytes(picture: np.ndarray) -> np.ndarray:

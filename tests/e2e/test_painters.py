@@ -22,6 +22,7 @@ from gimp3d import commands, pipeline
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
+from gimp3d.job import RemovalJob
 from gimp3d.pipeline import RemovalResult, RemovalSettings
 from gimp3d.priors.calls import Call
 from gimp3d.priors.inpaint import inpaint_reference, painter
@@ -277,3 +278,16 @@ def test_what_leaves_the_machine_is_said_before(tmp_path: Path, monkeypatch: pyt
     notice = "pictures of the scene are sent to 192.0.2.7:8188"
     assert found.err.startswith(f"gimp3d: note: {notice}\n")
     assert notice in [json.loads(line)["message"] for line in found.out.splitlines() if '"message"' in line]
+
+
+@pytest.mark.parametrize("spec", ["onnx:{}", "torchscript:{},512x512", "http://127.0.0.1:8188,{}", "file:{}"])
+def test_a_job_is_another_one_when_a_painters_file_changes(tmp_path: Path, spec: str) -> None:
+    file = tmp_path / "a, b.json"
+    job = RemovalJob(
+        "s.ply", "c.json", "r.json", "o.ply", inpaint=spec.format(file), refine_views="command:" + 300 * "x"
+    )
+    keys = []
+    for text in ("one", "two"):
+        file.write_text(text)
+        keys.append(commands._job_key(job, [], ()))
+    assert keys[0] != keys[1] == commands._job_key(job, [], ())
