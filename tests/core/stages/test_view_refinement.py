@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from pictures import disc, error, scenery
 
 from gimp3d.errors import BadInput
+from gimp3d.pipeline import STORED
 from gimp3d.priors.appearance import Painter, surroundings
 from gimp3d.priors.calls import Call
 from gimp3d.stages.propagate import Rule
-from gimp3d.stages.view_refinement import ViewToRefine, refine_views, side_by_side
+from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
+from gimp3d.store import StageStore
 
 TRUTH, HOLE = scenery(120, 160), disc()
 REFERENCE = scenery(90, 200, seed=1)
@@ -128,3 +132,14 @@ def test_views_with_nothing_invented_are_not_asked_about() -> None:
 def test_an_answer_of_another_shape_is_refused() -> None:
     with pytest.raises(BadInput, match="not the shape"):
         refine_views(Painter("p", lambda i, *_: i[:40], "its picture"), [view()], 0, Call())
+
+
+def test_what_was_asked_is_kept_for_resume(tmp_path: Path) -> None:
+    done = refine_views(painter(truth), [view()], 0, Call())
+    refused = refine_views(painter(lambda right, mask: right[:, ::-1]), [view("b")], 0, Call())
+    kept = ViewRefinement(done.views + refused.views, 0.5, "1 of 2")
+    StageStore(tmp_path, "key", STORED, resume=True).save("refine views", kept)
+    found = StageStore(tmp_path, "key", STORED, resume=True).load("refine views")
+    assert found is not None and found.facts() == kept.facts()
+    np.testing.assert_array_equal(found.views[0].image, kept.views[0].image)
+    assert found.views[1].image is None
