@@ -51,7 +51,7 @@ def big_lama(path: Path, colour: tuple[int, ...] = COLOUR) -> Path:
     return path
 
 
-def depth_model(path: Path, sizes: tuple[int, int] | None = None) -> Path:
+def depth_model(path: Path) -> Path:
     """A TorchScript file that takes a normalised picture and answers with its green channel, as disparity [1, h, w]."""
     import torch
 
