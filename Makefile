@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all test-blenders lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
+.PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
 	bench-harmonics bench-nnf bench-inpaint bench-fill bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
@@ -34,6 +34,17 @@ test-all: $(READY) lint
 # the add-on's tests under Blender 4.5 LTS and 5.2 LTS
 test-blenders: $(READY)
 	$(BIN)/python scripts/test_blenders.py
+
+# the painters with their optional libraries, ONNX Runtime and Google's client, in an environment of their own
+PAINTERS := build/painters
+
+$(PAINTERS)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(PAINTERS)
+	$(PAINTERS)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[torch,onnx,gemini,dev]'
+	@touch $@
+
+test-painters: $(PAINTERS)/.ready
+	$(PAINTERS)/bin/python -m pytest tests/core/priors tests/e2e/test_painters.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -265,6 +265,8 @@ class GIMP3D_PT_fill(Advanced, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         for name in ("inpaint", "depth_prior", "seed"):
             self.layout.prop(context.scene.gimp3d, name)
+        if context.scene.gimp3d.inpaint.startswith("gemini"):
+            self.layout.label(text="Google gets pictures, and bills each", icon="INFO")
 
 
 class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):

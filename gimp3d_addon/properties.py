@@ -97,14 +97,19 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     inpaint: StringProperty(
         name="Fill",
         default="exemplar",
-        description="What invents the part that no view shows: one of the list, or file:PATH, onnx:PATH or command:CMD",
+        description=(
+            "What invents the part that no view shows: one of the list, or file:PATH, torchscript:big-lama.pt, "
+            "onnx:PATH, http://127.0.0.1:8188 (ComfyUI), http://127.0.0.1:7860 (Automatic1111), gemini or command:CMD"
+        ),
         search=lambda _, context, text: INPAINT,
         search_options={"SUGGESTION"},
     )
     depth_prior: StringProperty(
         name="Surface",
         default="auto",
-        description="How the hidden surface goes on: one of the list, or file:PATH, or onnx:PATH",
+        description=(
+            "How the hidden surface goes on: one of the list, or file:PATH, onnx:PATH, torchscript:PATH or command:CMD"
+        ),
         search=lambda _, context, text: SURFACES,
         search_options={"SUGGESTION"},
     )

@@ -24,7 +24,10 @@ from .errors import BadInput, Cancelled, Gimp3dError
 from .job import SHADOWS, RemovalJob, load_job, save_job
 
 Namespace = argparse.Namespace
-DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH"
+DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH|torchscript:PATH|command:CMD, then ,disparity|,depth|,metric"
+PAINTERS = "file:PATH|onnx:PATH[,WxH]|torchscript:PATH|gemini[:MODEL]|http://HOST:PORT|command:CMD"
+REFINERS = "asks command:CMD or http://HOST:PORT to refine the painted views, the completed reference beside them"
+NETWORK = "providers may send pictures of the scene to other machines (gemini, http: of another host)"
 IMAGES = "photos; none: views are rendered from the scene"
 GROW = "take along what of the object the boxes cut off"
 SHADOW = "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
@@ -99,9 +102,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--inpaint",
         default="exemplar",
         metavar="PROVIDER",
-        help="exemplar|telea|ns|shiftmap|fsr|file:PATH|onnx:PATH[,WxH]|command:CMD",
+        help=f"exemplar|telea|ns|shiftmap|fsr|{PAINTERS}",
     )
     remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
+    remove.add_argument("--refine-views", metavar="PROVIDER", help=REFINERS)
+    remove.add_argument("--allow-network", action="store_true", help=NETWORK)
     remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
     remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
     remove.add_argument("--views-out", metavar="DIR", help="write every completed view")
@@ -261,7 +266,8 @@ def _masks(given: Namespace, shown: Reporter) -> None:
 
 
 def _remove(given: Namespace, shown: Reporter) -> None:
-    from .commands import run_removal
+    from .commands import job_settings, run_removal
+    from .pipeline import provider_notices
 
     folder = Path(given.job) if given.job else None
     if folder and given.scene is None:
@@ -281,7 +287,9 @@ def _remove(given: Namespace, shown: Reporter) -> None:
         if folder:
             save_job(folder, job)
     start = time.perf_counter()
-    summary = run_removal(job, folder, given.resume, shown)
+    for notice in provider_notices(job_settings(job), given.allow_network):
+        print(f"gimp3d: note: {notice}", file=sys.stderr)
+    summary = run_removal(job, folder, given.resume, shown, given.allow_network)
     shown.done(summary)
     if not given.quiet and given.progress == "bar":
         counts = summary["counts"]

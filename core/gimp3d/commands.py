@@ -226,7 +226,11 @@ def write_orbit(
 
 
 def run_removal(
-    job: RemovalJob, folder: Path | None = None, resume: bool = False, progress: Progress = silent
+    job: RemovalJob,
+    folder: Path | None = None,
+    resume: bool = False,
+    progress: Progress = silent,
+    allow_network: bool = False,  # never the job's to say: it may come from somebody else
 ) -> dict[str, Any]:
     """Run a removal from files to files; returns the summary (CONTRACT: remove, --summary)."""
     start = time.perf_counter()
@@ -254,7 +258,17 @@ def run_removal(
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     store = StageStore(folder / "stages", _job_key(job, views, (extra, shadow)), STORED, resume) if folder else None
     result = remove_object(
-        file.gaussians, views, region, settings, _clean_id(job.reference), given, progress, store, extra, shadow
+        file.gaussians,
+        views,
+        region,
+        settings,
+        _clean_id(job.reference),
+        given,
+        progress,
+        store,
+        extra,
+        shadow,
+        allow_network,
     )
     write_ply(out, file, result.keep, result.added)
     if job.views_out:
@@ -283,6 +297,7 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
     if not 0 <= job.seed < 1 << 32:
         raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
     settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
+    settings = replace(settings, refine_views=job.refine_views or "")
     settings = replace(settings, masks=replace(settings.masks, grow=job.grow))
     shadow = _shadow(job.shadow, job.shadow_masks)
     if settings.shadow == "off" and shadow == "mask":
@@ -421,6 +436,7 @@ def _summary(
             }
             for chart in result.charts
         ],
+        "refined_views": result.refined_views,
         "references": [asdict(choice) for choice in result.references],
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],
@@ -463,18 +479,27 @@ def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():
             digest.update(Path(path).read_bytes())
-    for provider in (job.inpaint, job.depth_prior):
-        path = provider.partition(":")[2]
-        while path and not Path(path).is_file():  # options follow a file's name after commas
-            path = path.rpartition(",")[0]
-        if path:
-            digest.update(Path(path).read_bytes())
+    for provider in (job.inpaint, job.depth_prior, job.refine_views or ""):
+        for file in _files_of(provider):
+            digest.update(file.read_bytes())
     for view in views:
         digest.update(view.camera.id.encode() + view.camera.viewmat.tobytes() + view.camera.K.tobytes())
         digest.update(view.image.tobytes())
         for mark in marks:
             digest.update(mark[view.camera.id].tobytes() if view.camera.id in mark else b"none")
     return digest.hexdigest()
+
+
+def _files_of(provider: str) -> list[Path]:
+    """The files that a provider names: a model or picture, options after commas, or a server's workflow after one."""
+    name, _, rest = provider.partition(":")
+    if name == "command":
+        return []
+    if name in ("http", "https"):
+        rest = rest.partition(",")[2]
+    parts = rest.split(",")
+    named = (Path(",".join(parts[:k])) for k in range(len(parts), 0, -1))
+    return [path for path in named if path.is_file()][:1]
 
 
 def to_bytes(picture: np.ndarray) -> np.ndarray:

@@ -38,6 +38,7 @@ class RemovalJob:
     reference_image: str | None = None
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
+    refine_views: str | None = None  # provider that refines painted views beside the reference
     preset: str = "balanced"
     set: dict[str, str] = field(default_factory=dict)  # single settings that override the preset
     views_out: str | None = None

@@ -17,8 +17,9 @@ from .box import Box, Region
 from .camera import Camera
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
-from .priors.inpaint import Appearance, inpaint_reference, paste_picture
-from .priors.monodepth import depth_prior
+from .priors.calls import Call
+from .priors.inpaint import Appearance, check_provider, inpaint_reference, painter, paste_picture
+from .priors.monodepth import check_depth_prior, depth_prior, looks
 from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, footprint, render, surface_depth, touched_window
 from .solvers.harmonics import HarmonicsSettings
@@ -58,6 +59,7 @@ from .stages.reference import (
 from .stages.refine import (
     Refinement,
     RefineSettings,
+    looked_at,
     observed,
     refine_gaussians,
 )
@@ -66,12 +68,15 @@ from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_
 from .stages.selection import Selection, SelectionSettings
 from .stages.shadow import Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
+from .stages.view_refinement import RefinedView, ViewRefinement, ViewToRefine, refine_views
 from .stages.witness import Witness
 from .threads import parallel_map
 
 R = TypeVar("R")
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
+REFINERS = ("command", "http", "https")  # who may be asked to refine views
+REFINING = 0.5  # share of a painted hole that a refining painter may change (img2img's denoising strength)
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views up to which a hole that cannot be filled is let be
 
 
@@ -96,6 +101,9 @@ class RemovalSettings:
     extra_references: int = 3  # views completed after the first one, where it does not reach
     extra_gain: float = 0.01  # share of the hole that an extra reference must still find open
     random_seed: int = 0
+    refine_views: str = ""  # who is asked to refine painted views beside their reference; empty: nobody
+    painter_seconds: float = 600.0  # that a painter or model outside this program may take for one picture
+    prompt: str = ""  # what stands behind the object, for painters that read
 
 
 PRESETS: dict[str, RemovalSettings] = {
@@ -142,11 +150,11 @@ class StageReport:
 class Picture:
     """A stage's result to look at; `report` draws it by its kind."""
 
-    kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules
+    kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules | refined
     title: str
     image: np.ndarray  # [H, W, 3] uint8, the view
     # per kind: (target) | (hole) | (light that arrives, lifted) | (depth, target) | (ring, line, s_f) | (target)
-    # | (rows, cols) | (rules, raw)
+    # | (rows, cols) | (rules, raw) | (the view before)
     data: tuple[np.ndarray, ...]
 
 
@@ -171,6 +179,7 @@ class RemovalResult:
     shadow: dict[str, Any] = field(default_factory=dict)  # see Shadow.facts
     reflection: dict[str, Any] = field(default_factory=dict)  # see Reflection.facts
     lifted: int = 0  # Gaussians that are removed and added as their light changed
+    refined_views: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts; empty: nobody was asked
 
 
 class Store(Protocol):
@@ -193,8 +202,8 @@ class View:
 class _Run:
     """Runs stages one after the other: times them, keeps their words, and takes finished ones from the store."""
 
-    def __init__(self, store: Store | None, progress: Progress) -> None:
-        self.store, self.progress = store, progress
+    def __init__(self, store: Store | None, progress: Progress, allow_network: bool = False) -> None:
+        self.store, self.progress, self.allow_network = store, progress, allow_network
         self.stages: list[StageReport] = []
         self.warnings: list[str] = []
         self.pictures: list[Picture] = []
@@ -213,6 +222,11 @@ class _Run:
         self.progress(name, 1, 1, reason)
         return result
 
+    def call(self, option: str, stage: str, settings: RemovalSettings, strength: float = 1.0) -> Call:
+        """What whoever a stage asks outside this program may do."""
+        seconds, network = settings.painter_seconds, self.allow_network
+        return Call(option, stage, self.progress, seconds, network, settings.prompt, strength)
+
 
 def remove_object(
     scene: Gaussians,
@@ -225,6 +239,7 @@ def remove_object(
     store: Store | None = None,
     extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
     shadow_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, for shadow="mask": its shadow
+    allow_network: bool = False,  # whether providers may send pictures off this machine
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid (the paper's pipeline; METHOD).
 
@@ -244,7 +259,9 @@ def remove_object(
     IllPosed
         If the task has no defined answer, with the reason.
     """
-    run = _Run(store, progress)
+    run = _Run(store, progress, allow_network)
+    for notice in provider_notices(settings, allow_network):
+        progress("read", 0, 1, notice)
     photos = {v.camera.id: v.image for v in views}
     cameras = [v.camera for v in views]
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
@@ -258,6 +275,7 @@ def remove_object(
     exposures = _exposures(scene, masks, photos)
     levelled = {name: e.image for name, e in exposures.items()}
     open_views = masks.views
+    best: dict[str, tuple[int, Reference]] = {}  # ID → how many pixels the reference painted that painted most of them
     hits: dict[str, Hits] = {}
     charts: tuple[Chart, ...] = ()
     unlit, lit = scene, NOT_LIT
@@ -345,11 +363,14 @@ def remove_object(
         rules = {p.camera_id: p.rule_map(*painted[p.camera_id].shape[:2]) for p in painting.views}
         del painting
         for name, rule in rules.items():
+            reached = int(((rule != Rule.UNTOUCHED) & (rule != Rule.UNREACHED)).sum())
+            best[name] = max(best.get(name, (0, completed)), (reached, completed), key=lambda found: found[0])
             told[name] = np.where((rule == Rule.UNTOUCHED) | (rule == Rule.UNREACHED), told.get(name, rule), rule)
         near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
     buffers.release()
+    asked = _views_refined(run, masks, painted, told, {name: r for name, (_, r) in best.items()}, settings)
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
     if left > settings.extra_gain * masks.hole_pixels:
@@ -369,8 +390,29 @@ def remove_object(
     parallel_map(finish, masks.views)
     pictures = {r.camera.id: r.image for r in done}
     charts = tuple(replace(c, image=pictures.get(c.camera.id, c.image)) for c in shown)
-    result = replace(_finish(run, keep, added, masks, charts, painted, []), open_pixels=left, verdict=verdict)
+    result = _finish(run, keep, added, masks, charts, painted, [])
+    result = replace(result, open_pixels=left, verdict=verdict, refined_views=asked)
     return lit.with_changes(result, unlit)
+
+
+def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
+    """What providers send where and what that costs, to be said before they do.
+
+    Raises
+    ------
+    BadInput
+        If a provider would fail after minutes: it is unknown, lacks a file or a library, or is not allowed.
+    """
+    run = _Run(None, silent, allow_network)
+    notices = [check_provider(settings.inpaint, run.call("--inpaint", "read", settings))]
+    check_depth_prior(settings.depth_prior, run.call("--depth-prior", "read", settings))
+    if settings.refine_views:
+        if not settings.refine.steps:
+            raise BadInput("--refine-views: this preset does no refinement that would use them; use balanced or best")
+        if settings.refine_views.partition(":")[0] not in REFINERS:
+            raise BadInput(f"--refine-views: unknown provider {settings.refine_views!r}; use http://… or command:CMD")
+        notices.append(painter(settings.refine_views, run.call("--refine-views", "read", settings)).notice)
+    return [notice for notice in notices if notice]
 
 
 def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
@@ -679,6 +721,7 @@ def _fill_from_chart(
             None if chart.kind == "plane" else disparity_of(chart.depth),
             chart.camera.K,
             ~chart.known & ~hole,
+            run.call("--inpaint", f"appearance{so_far.suffix}", settings),
         )
 
     appearance: Appearance = run(f"appearance{so_far.suffix}", complete)
@@ -785,6 +828,44 @@ def _needed_texels(chart: Chart, number: int, views: Sequence[ViewMasks], hits: 
     return needed | (scipy.ndimage.binary_fill_holes(needed) & chart.hole)
 
 
+def _views_refined(
+    run: _Run,
+    masks: Masks,
+    painted: dict[str, np.ndarray],  # changed where an answer is accepted
+    told: dict[str, np.ndarray],  # the same
+    references: Mapping[str, Reference],  # ID → the one that painted most of the view
+    settings: RemovalSettings,
+) -> dict[str, Any]:
+    """Ask a painter to refine the painted views beside their reference; returns what became of that."""
+    if not settings.refine_views:
+        return {}
+    views = [
+        ViewToRefine(v.camera.id, painted[v.camera.id], told[v.camera.id], references[v.camera.id].image,
+                     references[v.camera.id].target)
+        for v in masks.views
+        if v.camera.id in told
+    ]  # fmt: skip
+    call = run.call("--refine-views", "refine views", settings, REFINING)
+    asked: ViewRefinement = run(
+        call.stage,
+        lambda: refine_views(
+            painter(settings.refine_views, call), looked_at(views, settings.refine), settings.random_seed, call
+        ),
+    )
+    pictures = []
+    for view in asked.views:
+        name = view.camera_id
+        if view.image is None:
+            run.warnings.append(f"--refine-views: {name} is left as it was: {view.reason}")
+            continue
+        before, rule = painted[name], told[name]
+        told[name] = np.where((view.image != before).any(-1), np.uint8(Rule.REFINED), rule)
+        painted[name] = view.image
+        pictures.append(Picture("refined", f"{name} refined: before, after", view.image, (before,)))
+    run.pictures += _spread(pictures)
+    return {"provider": settings.refine_views, **asked.facts()}
+
+
 def _refined(
     run: _Run,
     kept: Gaussians,
@@ -822,7 +903,9 @@ def _fill_from_one_view(
     base, rough = so_far.painted[view.camera.id], _rough(so_far.charts, settings)
     completed: DepthCompletion = run(
         f"depth{so_far.suffix}",
-        lambda: _complete_depth(view, so_far.views, so_far.hits, base, settings, given, first=not so_far.suffix),
+        lambda: _complete_depth(
+            view, so_far.views, so_far.hits, base, settings, given, run, f"depth{so_far.suffix}", not so_far.suffix
+        ),
     )
     depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
     if rough:
@@ -830,7 +913,16 @@ def _fill_from_one_view(
         depth = snapped(depth, so_far.hits[view.camera.id].depth, scatter).astype(np.float32)
     appearance: Appearance = run(
         f"appearance{so_far.suffix}",
-        lambda: _appearance(view, depth, so_far.views, so_far.photos, base, settings, given),
+        lambda: _appearance(
+            view,
+            depth,
+            so_far.views,
+            so_far.photos,
+            base,
+            settings,
+            given,
+            run.call("--inpaint", f"appearance{so_far.suffix}", settings),
+        ),
     )
     run.warnings += appearance.warnings
     name = view.camera.id
@@ -942,6 +1034,8 @@ def _complete_depth(
     base: np.ndarray,
     settings: RemovalSettings,
     given: np.ndarray | None,
+    run: _Run,
+    stage: str = "depth",
     first: bool = True,  # reference; a file's prior is of that view
 ) -> DepthCompletion:
     """The reference's depth: the charts', unless the user has another prior.
@@ -960,12 +1054,16 @@ def _complete_depth(
     picture, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:
         spec = "auto"
-    if spec.startswith("onnx:"):
+    if looks(spec):
         if given is not None:
             picture = paste_picture(base, view.target, given, "--reference-image", ~view.silhouette).image
         else:
-            picture = inpaint_reference(settings.inpaint, base, view.target, settings.random_seed).image
-    prior = depth_prior(spec, view.camera.height, view.camera.width, picture)
+            first_fill = run.call("--inpaint", stage, settings)
+            picture = inpaint_reference(
+                settings.inpaint, base, view.target, settings.random_seed, call=first_fill
+            ).image
+    call = run.call("--depth-prior", stage, settings)
+    prior = depth_prior(spec, view.camera.height, view.camera.width, picture, call)
     surface = spec if spec in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
     return complete_depth(
@@ -981,7 +1079,7 @@ def preview(
     shown = [Picture("mask", f"Region to fill in {name}", picture, (view.target,))]
     if view.target.any():
         try:
-            completed = _complete_depth(view, views, {}, picture, settings, None)
+            completed = _complete_depth(view, views, {}, picture, settings, None, _Run(None, silent))
         except IllPosed:
             return tuple(shown)  # the region is worth seeing all the more
         depth = np.where(view.target, completed.depth, view.depth_after).astype(np.float32)
@@ -1006,6 +1104,7 @@ def _appearance(
     base: np.ndarray,
     settings: RemovalSettings,
     given: np.ndarray | None,
+    call: Call,
 ) -> Appearance:
     """The reference without the object: the given picture, or what photos show and the provider's fill for the rest."""
     if given is not None:
@@ -1018,7 +1117,9 @@ def _appearance(
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
     hole = view.target & ~seen
-    filled = inpaint_reference(settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K)
+    filled = inpaint_reference(
+        settings.inpaint, base, hole, settings.random_seed, disparity_of(depth), view.camera.K, call=call
+    )
     share = seen.sum() / max(1, view.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
@@ -1194,5 +1295,7 @@ STORED = (
     PaintedView,
     Appearance,
     Refinement,
+    RefinedView,
+    ViewRefinement,
     Verdict,
 )

@@ -87,7 +87,7 @@ def write_removal_report(
     for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
         name = f"stage_{k:02d}.png"
         write_png(folder / name, draw(picture))
-        stage_pictures.append((picture.title, name, picture.kind in ("rules", "shadow")))
+        stage_pictures.append((picture.title, name, picture.kind in ("rules", "shadow", "refined")))
     page = _page(summary, pairs, flips, stage_pictures, result.charts, result.references)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
@@ -120,6 +120,8 @@ def draw(picture: Picture) -> np.ndarray:
         return fit_plot(picture.data[0], picture.data[1], picture.data[2])
     if picture.kind == "mapping":
         return offset_colours(picture.image, *picture.data)
+    if picture.kind == "refined":
+        return np.hstack([picture.data[0], picture.image])
     if picture.kind == "rules":
         marked = picture.image
         for rule, (_, colour) in RULE_COLOURS.items():

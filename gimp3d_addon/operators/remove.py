@@ -29,7 +29,8 @@ class RunsRemoval(RunsChild):
         context.scene.gimp3d.last_job = str(self.folder)
         forecast = steps.forecast(context)
         self._told = forecast.seconds if forecast and not more else 0.0
-        arguments = ["remove", "--job", str(self.folder), *more, "--progress", "json"]
+        network = ["--allow-network"] * bpy.app.online_access
+        arguments = ["remove", "--job", str(self.folder), *more, *network, "--progress", "json"]
         return Worker(arguments, python_of(context), Clock(forecast) if forecast else None)
 
     def collect(self, context: bpy.types.Context) -> None:

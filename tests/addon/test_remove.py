@@ -6,6 +6,7 @@ import json
 import shutil
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d_addon import jobs, splats
+from gimp3d_addon.operators import remove
 from gimp3d_addon.worker import Worker
 
 
@@ -43,6 +45,16 @@ def prepare(folder: Path, frame: Matrix | None = None) -> bpy.types.Object:
     box.matrix_world = frame @ Matrix.LocRotScale(Vector(REGION[0].center), None, Vector(REGION[0].size))
     bpy.ops.gimp3d.import_cameras(filepath=str(folder / "transforms.json"))
     return splat
+
+
+@pytest.mark.parametrize("online", [False, True])
+def test_pictures_leave_the_machine_only_where_blender_may_go_online(
+    online: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remove, "bpy", SimpleNamespace(app=SimpleNamespace(online_access=online)))
+    monkeypatch.setattr(remove, "Worker", lambda arguments, *_: arguments)
+    arguments = remove.RunsRemoval.run(SimpleNamespace(folder=tmp_path), bpy.context, "--resume")
+    assert ("--allow-network" in arguments) == online and "--resume" in arguments
 
 
 def test_remove_makes_a_new_object_hides_the_source_and_restores(folder: Path) -> None:

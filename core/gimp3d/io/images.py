@@ -23,7 +23,16 @@ def read_image(path: Path | str) -> np.ndarray:
     BadInput
         If it is missing or not a picture.
     """
-    picture = _read(Path(path))
+    try:
+        data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII names on Windows
+    except OSError as error:
+        raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
+    return decode_image(data, str(path))
+
+
+def decode_image(data: np.ndarray | bytes, name: str) -> np.ndarray:
+    """A picture file's bytes, as `read_image` gives them; `name` is for messages."""
+    picture = _decoded(np.frombuffer(data, np.uint8), name)
     if picture.dtype == np.uint16:
         picture = (picture.astype(np.uint32) * 255 + 32767) // 65535
     elif picture.dtype != np.uint8:
@@ -49,12 +58,18 @@ def write_png(
     picture: np.ndarray,  # [H, W, 3] uint8 RGB, [H, W] uint8 or bool (as 0/255)
 ) -> None:
     """Write a PNG atomically."""
+    data = encode_png(picture)
+    write_atomically(Path(path), lambda f: f.write(data))
+
+
+def encode_png(picture: np.ndarray) -> bytes:
+    """A picture as `write_png` writes it."""
     if picture.dtype == bool:
         picture = picture.astype(np.uint8) * 255
     ok, data = cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)
     if not ok:
-        raise BadInput(f"cannot encode {path} as PNG")
-    write_atomically(Path(path), lambda f: f.write(data.tobytes()))
+        raise BadInput(f"cannot encode a picture of {'×'.join(map(str, picture.shape))} as PNG")
+    return data.tobytes()
 
 
 def undistorted(camera: Camera) -> Camera:
@@ -92,16 +107,11 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
     return photo, undistorted(camera)
 
 
-def _read(path: Path) -> np.ndarray:
+def _decoded(data: np.ndarray, name: str) -> np.ndarray:
     try:
-        data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII names on Windows
-    except OSError as error:
-        raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
-    flags = cv2.IMREAD_UNCHANGED
-    try:
-        picture = cv2.imdecode(data, flags) if len(data) else None
+        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
     except cv2.error:
         picture = None
     if picture is None:
-        raise BadInput(f"{path} is not a picture that can be read")
+        raise BadInput(f"{name} is not a picture that can be read")
     return picture

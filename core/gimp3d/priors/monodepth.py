@@ -7,7 +7,8 @@ up to scale). `relative_disparity` brings all of them to disparity of any scale 
 
 from __future__ import annotations
 
-import re
+import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,14 +16,21 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..io.images import write_png
 from ..solvers.robust import robust_fit
+from . import command, torchscript
+from .calls import Call, waited
+from .networks import IMAGENET_MEAN, IMAGENET_STD, as_depth, path_and_size
 from .onnx import OnnxModel, read_model
+from .pasting import scaled
 
 KINDS = ("disparity", "depth", "metric")
-IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)  # of RGB in [0, 1], as published models were trained
-IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
 FREE_SIZE = (518, 518)  # (width, height) for models that take any size: 37 patches of 14 px, as Depth Anything
-USAGE = "use auto, harmonic, planar, file:PATH or onnx:PATH, the path followed by ,disparity ,depth or ,metric"
+LOOKING = ("onnx", "torchscript", "command")  # providers that look at a picture of the view
+USAGE = (
+    "use auto, harmonic, planar, file:PATH, onnx:PATH, torchscript:PATH or command:CMD, followed by ,disparity ,depth "
+    "or ,metric"
+)
 
 
 @dataclass(frozen=True)
@@ -33,48 +41,77 @@ class DepthPrior:
     kind: str = "disparity"  # disparity | depth | metric
 
 
+def looks(spec: str) -> bool:
+    """Whether a provider looks at a picture of the view without the object."""
+    return spec.partition(":")[0] in LOOKING
+
+
 def depth_prior(
-    spec: str,  # auto | harmonic | planar | file:PATH[,KIND] | onnx:PATH[,KIND][,WIDTHxHEIGHT]
+    spec: str,  # auto | harmonic | planar | (file|onnx|torchscript|command):ARGUMENT[,KIND][,WIDTHxHEIGHT]
     height: int,
     width: int,
     image: np.ndarray | None = None,  # [H, W, 3] uint8, the view without the object; what a model looks at
+    call: Call = Call("--depth-prior", "depth"),
 ) -> DepthPrior | None:
     """The prior that `spec` names, of the view's size, or None where the scene alone decides.
 
     A file holds disparity unless it is said to hold depth (0 = no value): .npy, or any picture that OpenCV reads with
-    one channel of 8, 16 or 32 bits. It may have another resolution than the view, not another shape. A model is run by
-    OpenCV on the view, squeezed to the size that the model declares (else the one given after its path, else 518×518)
-    and normalised by ImageNet's mean and deviation; its first output of two long axes is resized back.
+    one channel of 8, 16 or 32 bits. It may have another resolution than the view, not another shape. A network sees
+    the view, squeezed to the size that the model declares (else the one given after its path, else 518×518) and
+    normalised by ImageNet's mean and deviation; its first output of two long axes is resized back. A command gets
+    {image} and writes such a file: {out}, a PNG, or {npy}.
 
     Raises
     ------
     BadInput
-        If the provider is unknown or its file cannot be used.
+        If the provider is unknown or its file, model or program cannot be used.
     """
-    name, _, rest = spec.partition(":")
-    if spec in ("auto", "harmonic", "planar"):
+    provider = _provider(spec, call)
+    if provider is None:
         return None
-    if name not in ("file", "onnx"):
-        raise BadInput(f"--depth-prior: unknown provider {spec!r}; {USAGE}")
-    size = re.search(r",(\d+)x(\d+)$", rest) if name == "onnx" else None
-    if size:
-        rest = rest[: size.start()]
-    path, _, kind = rest.rpartition(",")
-    if kind not in KINDS:
-        path, kind = rest, "disparity"
-    if name == "file":
-        values = _from_file(Path(path), height, width)
-        if kind != "disparity":
-            values = np.where(values == 0, np.nan, values)
-    else:
-        if image is None:
-            raise BadInput("--depth-prior onnx: there is no picture to look at")
-        values = _from_model(Path(path), image, (int(size[1]), int(size[2])) if size else None)
+    look, kind, of_depth = provider
+    if image is None and looks(spec):
+        raise BadInput(f"{call.option} {spec.partition(':')[0]}: there is no picture to look at")
+    values = look(image, height, width)
+    if of_depth:
+        values = np.where(values == 0, np.nan, values)
     if not np.isfinite(values).any():
-        raise BadInput(f"--depth-prior: {path} gives no finite value")
+        raise BadInput(f"{call.option}: {spec.partition(':')[2]} gives no finite value")
     if values.shape != (height, width):
         values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
     return DepthPrior(values.astype(np.float32), kind)
+
+
+def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) -> None:
+    """Raise BadInput now if `depth_prior` would for reasons that do not depend on the view."""
+    _provider(spec, call)
+
+
+Look = Callable[[np.ndarray | None, int, int], np.ndarray]  # (picture, height, width) → [h, w] float32
+
+
+def _provider(spec: str, call: Call) -> tuple[Look, str, bool] | None:
+    """Who looks, what its numbers are, and whether 0 stands for no value."""
+    name, _, rest = spec.partition(":")
+    if spec in ("auto", "harmonic", "planar"):
+        return None
+    if name not in ("file", *LOOKING) or (name != "file" and not rest):
+        raise BadInput(f"{call.option}: unknown provider {spec!r}; {USAGE}")
+    size = None
+    if name in ("onnx", "torchscript"):
+        path, size = path_and_size(rest, f"{call.option} {name}")
+        rest = str(path)
+    before, _, kind = rest.rpartition(",")
+    if kind not in KINDS:
+        before, kind = rest, "disparity"
+    if name == "file":
+        return lambda _, h, w: _from_file(Path(before), h, w), kind, kind != "disparity"
+    if name == "command":
+        return _by_command(before, call), kind, kind != "disparity"
+    if name == "onnx":
+        return _by_onnx(Path(before), size, call), kind, False
+    model = torchscript.read_model(f"{call.option} torchscript", Path(before))
+    return lambda image, h, w: _answer(model.run, model.who, image, size, call), kind, False
 
 
 def relative_disparity(
@@ -133,27 +170,55 @@ def _from_file(path: Path, height: int, width: int) -> np.ndarray:
     return values
 
 
-def _from_model(path: Path, image: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
+def _by_command(text: str, call: Call) -> Look:
+    words = command.split(text, call.option, ("{image}", "{out}"), ("{out}", "{npy}"))
+
+    def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
+        assert image is not None
+        with tempfile.TemporaryDirectory(prefix="gimp3d-", ignore_cleanup_errors=True) as folder:
+            paths = {
+                f"{{{n}}}": Path(folder) / f
+                for n, f in (("image", "image.png"), ("out", "out.png"), ("npy", "out.npy"))
+            }
+            write_png(paths["{image}"], image)
+            command.run(words, paths, call)
+            found = next((paths[name] for name in ("{npy}", "{out}") if paths[name].exists()), None)
+            if found is None:
+                raise BadInput(f"{call.option} command: {words[0]} wrote neither {{out}} nor {{npy}}")
+            return _from_file(found, height, width)
+
+    return look
+
+
+def _by_onnx(path: Path, size: tuple[int, int] | None, call: Call) -> Look:
+    model = read_model(f"{call.option} onnx", path)
+    size = declared_size(model) or size
+
+    def run(blob: np.ndarray) -> tuple[np.ndarray, ...]:
+        return model.run({_looking(model): blob})
+
+    return lambda image, h, w: _answer(run, f"{call.option} onnx: {path}", image, size, call)
+
+
+def _answer(
+    run: Callable[[np.ndarray], tuple[np.ndarray, ...]],  # [1, 3, h, w] float32 → what the network answers
+    who: str,
+    image: np.ndarray | None,
+    size: tuple[int, int] | None,
+    call: Call,
+) -> np.ndarray:
     """[h, w] float32, a network's answer to a picture."""
-    model = read_model("--depth-prior onnx", path)
-    width, height = declared_size(model) or size or FREE_SIZE
-    method = cv2.INTER_AREA if width * height < image.shape[0] * image.shape[1] else cv2.INTER_CUBIC
-    squeezed = cv2.resize(image, (width, height), interpolation=method).astype(np.float32) / 255
-    outputs = model.run({_looking(model): ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]})
-    for output in outputs:
-        values = np.squeeze(output)
-        if values.ndim == 2 and min(values.shape) > 1:
-            return values.astype(np.float32)
-    shapes = ", ".join("×".join(map(str, o.shape)) for o in outputs)
-    raise BadInput(f"--depth-prior onnx: {path} answers with {shapes}, which is no depth picture")
+    assert image is not None
+    squeezed = scaled(image, *(size or FREE_SIZE)).astype(np.float32) / 255
+    blob = ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]
+    return as_depth(waited(who.rpartition("/")[2], lambda: run(blob), call, lambda: "looks at the view"), who)
 
 
 def declared_size(model: OnnxModel) -> tuple[int, int] | None:
     """(width, height) of the first input of four axes [N, C, H, W], or None if the model takes any."""
-    dims = model.inputs.get(_looking(model), ())
-    return (dims[3], dims[2]) if len(dims) == 4 and dims[2] * dims[3] else None
+    return model.size(_looking(model))
 
 
 def _looking(model: OnnxModel) -> str:
-    """The input that takes the picture; a name that no input has lets OpenCV say what is wrong."""
+    """The input that takes the picture; a name that no input has lets who runs it say what is wrong."""
     return next((name for name, dims in model.inputs.items() if len(dims) == 4), next(iter(model.inputs), ""))

@@ -46,6 +46,7 @@ class Rule(IntEnum):
     UNREACHED = 4  # the reference does not see this surface
     RETARGETED = 5  # by the view's own pixels near the mapped source, which is itself hidden or off-screen
     OTHER_VIEW = 6  # the mapped source as another view shows it
+    REFINED = 7  # by whoever --refine-views asked; the last one, as it comes after the propagation
 
 
 OWN, REFERENCE, UNREACHED, RETARGETED, OTHER = 2, 3, 4, 5, 6  # the same, for the kernels
@@ -185,7 +186,7 @@ def propagate(
     painted = tuple(parallel_map(paint, views, at_once(reference.target.size)))
     counts = sum((np.bincount(p.rules.ravel(), minlength=len(Rule)) for p in painted), np.zeros(len(Rule), int))
     total = max(1, counts[1:].sum())
-    shares = ", ".join(f"{counts[r] / total:.0%} {r.name.lower().replace('_', ' ')}" for r in list(Rule)[1:])
+    shares = ", ".join(f"{counts[r] / total:.0%} {r.name.lower().replace('_', ' ')}" for r in list(Rule)[1:-1])
     return Propagation(painted, float(1 - counts[Rule.UNREACHED] / total), shares)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_
 from ..threads import parallel_map
 from .propagate import Rule
 
+V = TypeVar("V")
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
 C1, C2 = 0.01**2, 0.03**2
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
@@ -56,6 +58,7 @@ class Observation:
 # How far a painted pixel is believed, by the rule that gave its colour.
 TRUST = {
     Rule.EVIDENCE: 1.0,
+    Rule.REFINED: 0.5,
     Rule.OWN_PIXELS: 0.5,
     Rule.RETARGETED: 0.5,
     Rule.OTHER_VIEW: 0.25,
@@ -87,6 +90,11 @@ class Refinement:
     reason: str
 
 
+def looked_at(views: Sequence[V], settings: RefineSettings) -> Sequence[V]:
+    """Of many views as many as refinement looks at, evenly."""
+    return views[:: math.ceil(len(views) / settings.views) or 1]
+
+
 def refine_gaussians(
     frozen: Gaussians,  # the rest of the scene: its arrays are only read
     new: Gaussians,
@@ -100,8 +108,7 @@ def refine_gaussians(
     Every `held_out`-th view is left out of the gradient. The state that it likes best is kept, so the result is never
     worse there than the start. Without steps, views or new Gaussians the input is returned.
     """
-    seen = [o for o in observations if (o.weight[o.target] > 0).any()]
-    seen = seen[:: math.ceil(len(seen) / settings.views) or 1]
+    seen = looked_at([o for o in observations if (o.weight[o.target] > 0).any()], settings)
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
     views = parallel_map(lambda o: _View(frozen, o, settings), seen)

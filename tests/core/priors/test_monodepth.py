@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
 from onnx_files import model, pixelwise
+from stand_ins import depth_model
 
 from gimp3d.errors import BadInput
+from gimp3d.priors.calls import Call
 from gimp3d.priors.monodepth import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
     DepthPrior,
+    check_depth_prior,
     declared_size,
     depth_prior,
+    looks,
     relative_disparity,
 )
+from gimp3d.priors.networks import IMAGENET_MEAN, IMAGENET_STD
 from gimp3d.priors.onnx import read_model
 
 
@@ -147,20 +152,113 @@ def test_a_model_sees_the_normalised_picture_in_its_own_size(tmp_path, height, w
     assert declared_size(read_model("--depth-prior", path)) == (None if height == "h" else size)
 
 
-def test_a_model_that_predicts_disparity_guides_the_completion(tmp_path):
-    """From the file to the depth: a network that has learned this scene, up to scale and shift."""
+def scripted(folder, body):
+    """A command that runs a Python script with {image} and where its answer goes."""
+    path = folder / "depth.py"
+    path.write_text(f"import sys, cv2, numpy as np\nimage, out = sys.argv[1:]\n{body}\n", encoding="utf-8")
+    return f"command:'{sys.executable}' '{path}' {{image}}"
+
+
+@pytest.mark.parametrize("provider", ["onnx", "torchscript", "command"])
+def test_who_predicts_disparity_guides_the_completion(tmp_path, provider):
+    """From the file to the depth: somebody has learned this scene, up to scale and shift, which the ring tells."""
     from gimp3d.stages.depth import complete_disparity
 
-    path = tmp_path / "model.onnx"
-    path.write_bytes(network(120, 160, (0.0, 1.0, 0.0)))
     v, u = np.mgrid[:120, :160]
     truth = 0.3 + 0.1 * np.exp(-((u - 86) ** 2 + (v - 66) ** 2) / 300) + 0.05 * np.sin(u / 15)
     image = np.repeat(((truth - 0.2) / 0.3 * 255).round().astype(np.uint8)[..., None], 3, -1)
+    if provider == "onnx":
+        (tmp_path / "model.onnx").write_bytes(network(120, 160, (0.0, 1.0, 0.0)))
+        spec = f"onnx:{tmp_path}/model.onnx"
+    elif provider == "torchscript":
+        pytest.importorskip("torch")
+        spec = f"torchscript:{depth_model(tmp_path / 'model.pt')},160x120"
+    else:
+        spec = scripted(tmp_path, "np.save(out, cv2.imread(image)[..., 1] / 7 - 3)") + " {npy}"
     hole = np.hypot(v - 60, u - 80) < 28
-    prior = relative_disparity(depth_prior(f"onnx:{path}", 120, 160, image), truth, ~hole)
+    prior = relative_disparity(depth_prior(spec, 120, 160, image), truth, ~hole)
     found = complete_disparity(np.where(hole, 9, truth), ~hole, hole, prior)
-    assert found.reason.startswith("guided")
+    assert looks(spec) and found.reason.startswith("guided")
     assert np.percentile(np.abs(found.depth * truth - 1)[hole], 95) < 0.01
+
+
+# TorchScript
+
+
+@pytest.mark.parametrize("kind, given, size", [("", "", (518, 518)), (",depth", ",80x60", (80, 60))])
+def test_a_torchscript_model_sees_the_normalised_picture(tmp_path, kind, given, size):
+    pytest.importorskip("torch")
+    path, image = depth_model(tmp_path / "a, b.pt"), picture(90, 120)
+    found = depth_prior(f"torchscript:{path}{kind}{given}", 90, 120, image)
+    assert found.kind == (kind[1:] or "disparity") and found.values.shape == (90, 120)
+    wanted = answer(image, (0, 1, 0))
+    assert np.abs(found.values - wanted)[3:-3, 3:-3].mean() < 0.02 * np.ptp(wanted)
+
+
+def test_torchscript_models_that_cannot_look_are_refused(tmp_path):
+    torch = pytest.importorskip("torch")
+
+    class Means(torch.nn.Module):
+        def forward(self, image: torch.Tensor) -> torch.Tensor:
+            return image.mean((2, 3))
+
+    torch.jit.script(Means()).save(str(tmp_path / "m.pt"))
+    with pytest.raises(BadInput, match=r"--depth-prior torchscript: .* answers with 1×3, which is no depth picture"):
+        depth_prior(f"torchscript:{tmp_path}/m.pt", 30, 40, picture(30, 40))
+    with pytest.raises(BadInput, match=r"cannot read .*gone\.pt"):
+        check_depth_prior(f"torchscript:{tmp_path}/gone.pt")
+    with pytest.raises(BadInput, match="0x5 is no size for a picture"):
+        check_depth_prior(f"torchscript:{tmp_path}/m.pt,0x5")
+
+
+# Commands
+
+
+@pytest.mark.parametrize(
+    "out, write", [("{npy}", "np.save(out, d)"), ("{out}", "cv2.imwrite(out, d.astype(np.uint16))")]
+)
+def test_a_command_writes_what_a_file_would_hold(tmp_path, out, write):
+    image = picture(30, 40)
+    body = f"d = cv2.imread(image).astype(np.float32)[..., 0] * 100\nd[0, 0] = 0\n{write}"
+    found = depth_prior(f"{scripted(tmp_path, body)} {out},metric", 30, 40, image)
+    assert found.kind == "metric" and np.isnan(found.values[0, 0])  # 0 = no value, as in a file
+    np.testing.assert_array_equal(found.values[1:], image[1:, :, 2] * 100.0)
+
+
+@pytest.mark.parametrize(
+    "body, out, words",
+    [
+        ("sys.exit('no weights')", "{npy}", "ended with 1: no weights"),
+        ("pass", "{npy}", "wrote neither {out} nor {npy}"),
+        ("open(out, 'w').write('text')", "{out}", "not a depth picture"),
+        ("np.save(out, np.ones((9, 9, 3)))", "{npy}", "not a depth picture of one channel"),
+        ("np.save(out, np.full((30, 40), np.nan))", "{npy}", "gives no finite value"),
+        ("np.save(out, np.ones((30, 80)))", "{npy}", "not the shape of the view"),
+        ("", "", "does not say where {out} or {npy} goes"),
+        ("import time; time.sleep(9)", "{npy}", "was not done after 0.3 s"),
+    ],
+)
+def test_commands_that_fail_are_told(tmp_path, body, out, words):
+    with pytest.raises(BadInput) as error:
+        call = Call("--depth-prior", "depth", seconds=0.3 if "sleep" in body else 60)
+        depth_prior(f"{scripted(tmp_path, body)} {out}".strip(), 30, 40, picture(30, 40), call)
+    assert words in str(error.value) and "--depth-prior" in str(error.value) and "\n" not in str(error.value)
+
+
+# Files of networks that make no sense
+
+
+@pytest.mark.parametrize("given", ["0x0", "0x64", "9000x64"])
+def test_sizes_that_no_picture_has_are_refused(tmp_path, given):
+    (tmp_path / "m.onnx").write_bytes(network())
+    with pytest.raises(BadInput, match=f"--depth-prior onnx: {given} is no size for a picture"):
+        depth_prior(f"onnx:{tmp_path}/m.onnx,{given}", 30, 40, picture(30, 40))
+
+
+def test_models_that_declare_sizes_that_no_picture_has_are_refused(tmp_path):
+    (tmp_path / "m.onnx").write_bytes(network(1 << 40, 64))
+    with pytest.raises(BadInput, match="takes 64×1099511627776 pixels, which is no size for a picture"):
+        depth_prior(f"onnx:{tmp_path}/m.onnx", 30, 40, picture(30, 40))
 
 
 def test_unusable_models_are_refused_in_one_line(tmp_path, capfd):
@@ -168,7 +266,7 @@ def test_unusable_models_are_refused_in_one_line(tmp_path, capfd):
     cases = {
         "cannot read": None,
         "not an ONNX model": b"nothing at all, only words",
-        "OpenCV cannot run": network(48, 64, operator="NoSuchThing"),
+        " cannot run ": network(48, 64, operator="NoSuchThing"),
         "which is no depth picture": network(1, 64),
     }
     for words, data in cases.items():

@@ -1,0 +1,97 @@
+"""Providers of appearance that need nothing but this program and OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ..errors import BadInput
+from ..solvers.exemplar import ExemplarSettings, complete_picture
+from ..solvers.patchmatch import nearest_allowed
+from ..solvers.surface import tangent_planes
+from .appearance import Appearance, Provider, Unfinished, surroundings
+
+SPECK = 4  # px; smaller parts of a hole are interpolated
+CONFIDENCE_SCALE = 20.0  # grey levels of misfit at which the confidence has fallen to 1/e
+
+
+def without_specks(provider: Provider, view: Unfinished) -> Appearance:
+    """Parts of the hole of a few pixels are interpolated; the provider fills the rest."""
+    image, hole = view.image, view.hole
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
+    specks = hole & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
+    if specks.any():
+        rest = hole & ~specks
+        image = np.where(specks[..., None], telea(view).image, image)
+        if not rest.any():
+            return Appearance(image, 1.0, "a hole of a few pixels: interpolated")
+        hole = rest
+    return provider(replace(view, image=image, hole=hole))
+
+
+def exemplar(view: Unfinished) -> Appearance:
+    """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
+    near = surroundings(view.hole)
+    surface = None
+    if view.disparity is not None and view.K is not None:
+        corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])
+        surface = tangent_planes(view.disparity[near], view.K - corner)
+    unknown = None if view.unknown is None else view.unknown[near]
+    done = complete_picture(view.image[near], view.hole[near], ExemplarSettings(seed=view.seed), surface, unknown)
+    if np.isnan(done.misfit):
+        return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
+    confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    whole = view.image.copy()
+    whole[near] = done.image
+    how = "" if surface is None else ", laid along its surfaces"
+    words = f"filled with the view's own texture{how}, which fits to {done.misfit:.1f} grey levels"
+    return Appearance(whole, confidence, words)
+
+
+def telea(view: Unfinished) -> Appearance:
+    """Fast marching (Telea 2004), OpenCV."""
+    return _interpolated(view, "telea", cv2.INPAINT_TELEA)
+
+
+def navier_stokes(view: Unfinished) -> Appearance:
+    """Isophotes continued (Bertalmio 2001), OpenCV."""
+    return _interpolated(view, "ns", cv2.INPAINT_NS)
+
+
+def _interpolated(view: Unfinished, name: str, method: int) -> Appearance:
+    """By cv2.inpaint, which looks at a few pixels of the hole at the image's border: they hold the nearest colour."""
+    rows, cols = nearest_allowed(~view.hole)
+    filled = cv2.inpaint(view.image[rows, cols], view.hole.astype(np.uint8), 3, method)
+    return Appearance(filled, 0.3, f"interpolated by {name}")
+
+
+def shiftmap(view: Unfinished) -> Appearance:
+    """Shift maps (Pritch 2009), OpenCV's xphoto, which compares Lab colours."""
+    return _xphoto(view, "shiftmap", "INPAINT_SHIFTMAP", cv2.COLOR_RGB2Lab, cv2.COLOR_Lab2RGB)
+
+
+def fsr(view: Unfinished) -> Appearance:
+    """Frequency-selective reconstruction (Genser 2018), OpenCV's xphoto, the fast one."""
+    return _xphoto(view, "fsr", "INPAINT_FSR_FAST", cv2.COLOR_RGB2BGR, cv2.COLOR_BGR2RGB)
+
+
+def _xphoto(view: Unfinished, name: str, method: str, there: int, back: int) -> Appearance:
+    """One of xphoto's methods; their mask marks what is known."""
+    if not hasattr(cv2, "xphoto"):
+        raise BadInput(f"--inpaint {name} needs OpenCV's contrib modules (opencv-contrib-python-headless)")
+    colours = cv2.cvtColor(view.image, there)
+    filled = np.zeros_like(colours)
+    cv2.setRNGSeed(view.seed)
+    cv2.xphoto.inpaint(colours, (~view.hole).astype(np.uint8) * 255, filled, getattr(cv2.xphoto, method))
+    return Appearance(cv2.cvtColor(filled, back), 0.5, f"filled by {name}")
+
+
+PROVIDERS: dict[str, Provider] = {
+    "exemplar": exemplar,
+    "telea": telea,
+    "ns": navier_stokes,
+    "shiftmap": shiftmap,
+    "fsr": fsr,
+}

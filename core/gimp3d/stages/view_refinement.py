@@ -1,0 +1,143 @@
+"""Painted views refined by a painter that sees the completed reference beside them (paper 4.4: Ours + LeftRefill).
+
+LeftRefill (Cao 2024) stitches a reference and a masked view side by side, so that an inpainting model looks left to
+paint right. Here the right half is the propagated painting, which the painter may change inside the mask. Its answer
+is believed only where it is the view round the mask and still that painting inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..errors import BadInput
+from ..priors.appearance import Painter, surroundings
+from ..priors.calls import Call
+from ..priors.pasting import paste_picture, resized, scaled
+from .propagate import Rule
+
+KEPT = (Rule.UNTOUCHED, Rule.UNREACHED, Rule.EVIDENCE)  # pixels that nobody is asked about: known, or without a colour
+LEAST = 64  # pixels of a view that somebody is asked about
+LONGEST = 1024  # px of a panel's longer side; larger ones are reduced
+COARSE = 4.0  # px, σ of the blur under which answer and painting are compared: texture may change, structure may not
+# Grey levels, mean under that blur. On four scenes with truth, filled without a given picture, the true view is at most
+# 15 from the painting (median 7), the photo with the object 20 and more (median 48).
+MOST_DRIFT = 17.0
+
+
+@dataclass(frozen=True)
+class ViewToRefine:
+    """A painted view and the completed reference that painted most of it."""
+
+    camera_id: str
+    image: np.ndarray  # [H, W, 3] uint8
+    rules: np.ndarray  # [H, W] uint8, see Rule
+    reference: np.ndarray  # [H', W', 3] uint8
+    reference_target: np.ndarray  # [H', W'] bool, what was completed of it
+
+
+@dataclass(frozen=True)
+class RefinedView:
+    """What became of a view."""
+
+    camera_id: str
+    image: np.ndarray | None  # [H, W, 3] uint8; None: refused, the view stays as it was
+    drift: float  # grey levels that the answer differs from the painting under a blur; NaN: not compared
+    reason: str
+
+
+@dataclass(frozen=True)
+class ViewRefinement:
+    """All views that a painter was asked about."""
+
+    views: tuple[RefinedView, ...]
+    confidence: float  # share of the answers that were accepted
+    reason: str
+
+    def facts(self) -> dict[str, Any]:
+        """For the summary: where each view's refinement came from, or why there is none."""
+        return {
+            "asked": len(self.views),
+            "accepted": sum(v.image is not None for v in self.views),
+            "views": {v.camera_id: {"accepted": v.image is not None, "reason": v.reason} for v in self.views},
+        }
+
+
+def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: Call) -> ViewRefinement:
+    """Ask about one view after the other.
+
+    Raises
+    ------
+    BadInput
+        If the painter fails at the first view; later failures only refuse their view.
+    """
+    asked = [view for view in views if int(_mask(view).sum()) >= LEAST]
+    done: list[RefinedView] = []
+    for k, view in enumerate(asked):
+        part = replace(call, progress=lambda stage, _, __, words="", k=k: call.progress(stage, k, len(asked), words))
+        part.tell(f"{who.who} looks at {view.camera_id}")
+        try:
+            done.append(refine_view(who, view, seed, part))
+        except BadInput as error:
+            if not done:
+                raise
+            done.append(RefinedView(view.camera_id, None, float("nan"), str(error)))
+    accepted = sum(v.image is not None for v in done)
+    words = f"{accepted} of {len(done)} views refined by {who.who}" if done else "no view has anything to refine"
+    return ViewRefinement(tuple(done), accepted / max(1, len(done)), words)
+
+
+def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> RefinedView:
+    """One view; BadInput if the painter fails, a refused view if its answer does not agree."""
+    part = surroundings(_mask(view))
+    painted, mask = view.image[part], _mask(view)[part]
+    left = view.reference[surroundings(view.reference_target)] if view.reference_target.any() else view.reference
+    stitched, stitched_mask, beside = side_by_side(left, painted, mask)
+    answer = resized(who.paint(stitched, stitched_mask, seed, call), stitched_mask.shape, who.answer)
+    h, w = mask.shape
+    try:
+        pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
+    except BadInput as error:
+        return RefinedView(view.camera_id, None, float("nan"), str(error))
+    if pasted.warnings:
+        return RefinedView(view.camera_id, None, float("nan"), pasted.warnings[0])
+    drift = _drift(painted, pasted.image, mask)
+    if drift > MOST_DRIFT:
+        words = f"{who.who} painted something else: {drift:.0f} grey levels from what was propagated, under a blur"
+        return RefinedView(view.camera_id, None, drift, words)
+    whole = view.image.copy()
+    whole[part] = pasted.image
+    return RefinedView(
+        view.camera_id, whole, drift, f"{drift:.0f} grey levels from what was propagated; {pasted.reason}"
+    )
+
+
+def side_by_side(
+    reference: np.ndarray,  # [h', w', 3] uint8
+    view: np.ndarray,  # [h, w, 3] uint8
+    mask: np.ndarray,  # [h, w] bool
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The reference left, as high as the view right; the mask, empty on the left; the column where right begins."""
+    factor = min(1.0, LONGEST / max(mask.shape))
+    height, width = (max(1, round(factor * side)) for side in mask.shape)
+    beside = max(1, min(LONGEST, round(reference.shape[1] * height / reference.shape[0])))
+    right = scaled(view, width, height) if factor < 1 else view
+    shrunk = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
+    both = np.hstack([scaled(reference, beside, height), right])
+    return both, np.hstack([np.zeros((height, beside), bool), shrunk]), beside
+
+
+def _mask(view: ViewToRefine) -> np.ndarray:
+    return ~np.isin(view.rules, KEPT)
+
+
+def _drift(painted: np.ndarray, answer: np.ndarray, mask: np.ndarray) -> float:
+    """Mean difference inside the mask, under a blur that looks at the mask alone."""
+    inside = mask.astype(np.float32)
+    weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), COARSE), 1e-6)[..., None]
+    off = (answer.astype(np.float32) - painted) * inside[..., None]
+    return float(np.abs(cv2.GaussianBlur(off, (0, 0), COARSE) / weight)[mask].mean())
