@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -44,6 +46,7 @@ class GIMP3D_PG_region(bpy.types.PropertyGroup):
 class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     """What a removal needs, kept with the scene."""
 
+    id: StringProperty(name="ID", description="Tells this scene from others, for the jobs that belong to it")
     splat: PointerProperty(
         type=bpy.types.Object,
         name="Splat",
@@ -124,6 +127,12 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     )
 
 
+def _make_absolute(preferences: GIMP3D_preferences, _: bpy.types.Context) -> None:
+    """The file browser may give a path from the .blend's folder: another .blend would name another Python by it."""
+    if preferences.python.startswith("//"):
+        preferences.python = bpy.path.abspath(preferences.python)
+
+
 class GIMP3D_preferences(bpy.types.AddonPreferences):
     """Which Python runs the removal."""
 
@@ -133,6 +142,7 @@ class GIMP3D_preferences(bpy.types.AddonPreferences):
         name="Python",
         subtype="FILE_PATH",
         description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with what the extension brings",
+        update=_make_absolute,
     )
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -157,6 +167,14 @@ def preferences(context: bpy.types.Context) -> GIMP3D_preferences | None:
     """The add-on's preferences; None where it was registered from a checkout without being enabled."""
     addon = context.preferences.addons.get(GIMP3D_preferences.bl_idname)
     return addon.preferences if addon else None
+
+
+def user_folder(name: str) -> Path:
+    """A folder of the add-on's own in Blender's user folder, which updates leave alone."""
+    package = GIMP3D_preferences.bl_idname
+    if package.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(package, path=name, create=True))
+    return Path(bpy.utils.user_resource("DATAFILES", path=f"gimp3d/{name}", create=True))
 
 
 def register() -> None:

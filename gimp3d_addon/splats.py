@@ -7,6 +7,7 @@ attributes `scale`, `rotation`, `opacity` and `splat_color` hold activated value
 from __future__ import annotations
 
 import json
+import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from .native import attribute_values, is_native, read_native, write_native
 
 T = TypeVar("T")
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
+ID = "gimp3d_id"  # custom property of the object: the jobs that are about it know it by this
 COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
 GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
@@ -91,7 +93,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     )
     mesh.materials.append(splat_material())
     obj = bpy.data.objects.new(name, mesh)
-    obj.matrix_world = matrix
+    obj.matrix_world, obj[ID] = matrix, uuid.uuid4().hex
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
     set_display(obj, "As Points", len(gaussians) > MANY)

@@ -5,13 +5,16 @@ A failure is one line to the user, CANCELLED to the caller (a RuntimeError in sc
 
 from __future__ import annotations
 
+import textwrap
+from pathlib import Path
 from typing import Any
 
 import bpy
+from bpy.props import BoolProperty
 
 from gimp3d.errors import BadInput, Gimp3dError
 
-from .. import splats
+from .. import splats, trust
 from ..bridge import present
 from ..properties import preferences
 from ..worker import Worker
@@ -99,10 +102,7 @@ class RunsChild:
         if said != self._shown:  # drawing takes time too
             self._shown = said
             context.workspace.status_text_set(f"3D-GIMP: {said} (Esc cancels)")
-            for area in context.window.screen.areas:
-                for region in area.regions:
-                    if region.type == "UI":  # the panel, not the view
-                        region.tag_redraw()
+            redraw_panels(context)
         if not (ended or self.worker.cancelled):
             return {"PASS_THROUGH"}
         self._stop(context)
@@ -129,6 +129,7 @@ class RunsChild:
         RunsChild.running = None
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
+        redraw_panels(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
         if self.worker.cancelled:
@@ -151,6 +152,57 @@ class RunsChild:
         return {"CANCELLED"}
 
 
+class AsksFirst(RunsChild):
+    """Mixin: what the scene's providers would run is shown in full, and confirmed once on each machine.
+
+    Without a window nobody can be asked, so a script has to say that it is allowed.
+    """
+
+    allow_command: BoolProperty(
+        name="Allow Commands",
+        description="Run the command or model that the scene's settings name, unasked: for scripts that know the file",
+        options={"HIDDEN", "SKIP_SAVE"},
+    )
+    _shown: tuple[str, ...] = ()
+
+    def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
+        """What the user, or the .blend, chose."""
+        settings = context.scene.gimp3d
+        return settings.inpaint, settings.depth_prior
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        self._shown = tuple(trust.unconfirmed(self.providers(context)))
+        if not self._shown or bpy.app.background:
+            return self.execute(context)
+        return context.window_manager.invoke_props_dialog(
+            self, width=560, title="This file asks to run something on your machine", confirm_text="Allow and Run"
+        )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """All of it: what is cut off could be the part that does harm."""
+        column = self.layout.column(align=True)
+        for said in self._shown:
+            for line in said.splitlines():
+                for part in textwrap.wrap(line, 80, replace_whitespace=False, drop_whitespace=False):
+                    column.label(text=part)
+            column.separator()
+        column.label(text="Allow it only if you know it. The preferences list what you allowed.", icon="ERROR")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if self._shown and not bpy.app.background:
+            trust.allow(self._shown)
+        try:
+            strange = trust.unconfirmed(self.providers(context))
+            if strange and not self.allow_command:
+                what = "; ".join(strange).replace("\n", ", ")
+                raise BadInput(
+                    f"nobody has allowed this on this machine: {what}; Remove Object asks, a script gives allow_command=True"
+                )
+        except FAILURES as error:
+            return self._failed(error)
+        return super().execute(context)
+
+
 class GIMP3D_OT_cancel(bpy.types.Operator):
     """Stop what is running now; the scene stays as it was"""
 
@@ -165,6 +217,15 @@ class GIMP3D_OT_cancel(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         RunsChild.running.worker.cancel()
         return {"FINISHED"}
+
+
+def redraw_panels(context: bpy.types.Context) -> None:
+    """The panel, not the view: drawing takes time."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions:
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def current_splat(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -199,8 +260,18 @@ def select_only(context: bpy.types.Context, obj: bpy.types.Object) -> None:
 
 
 def python_of(context: bpy.types.Context) -> str:
+    """The chosen Python's path; empty: Blender's own.
+
+    Raises
+    ------
+    BadInput
+        If it depends on where the .blend lies, or Blender was started: another Python could lie there.
+    """
     chosen = preferences(context)
-    return bpy.path.abspath(chosen.python) if chosen and chosen.python else ""
+    python = chosen.python if chosen else ""
+    if python and not Path(python).is_absolute():
+        raise BadInput(f"the Python {python!r} in the preferences of 3D-GIMP must be a full path; choose it again")
+    return python
 
 
 CLASSES = (GIMP3D_OT_cancel,)

@@ -11,8 +11,8 @@ import bpy
 
 from gimp3d.errors import BadInput
 
-from ..properties import GIMP3D_preferences, preferences
-from ..worker import Worker, child_command, own_python
+from ..properties import preferences, user_folder
+from ..worker import Worker, core_folder, own_python
 from .base import RunsChild, python_of
 
 LIBRARIES = (  # as in pyproject.toml, which is not in the zip
@@ -50,10 +50,7 @@ USES = {"zstandard": "for newer .spz files"}
 
 def environment_folder() -> Path:
     """Where the button puts the environment: the extension's user folder, which updates leave alone."""
-    package = GIMP3D_preferences.bl_idname
-    if package.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(package, path="environment", create=True))
-    return Path(bpy.utils.user_resource("DATAFILES", path="gimp3d/environment", create=True))
+    return user_folder("environment")
 
 
 def environment_python(folder: Path) -> Path:
@@ -101,8 +98,7 @@ class GIMP3D_OT_check(RunsChild, bpy.types.Operator):
     found: ClassVar[dict[str, str]] = {}  # of the last check, for the preferences
 
     def start(self, context: bpy.types.Context) -> Worker:
-        *head, _, core = child_command([], python_of(context))
-        return Worker([], command=[*head, CHECK, core])
+        return Worker([], command=[python_of(context) or own_python(), "-X", "utf8", "-c", CHECK, core_folder()])
 
     def collect(self, context: bpy.types.Context) -> None:
         GIMP3D_OT_check.found = dict(self.worker.result())

@@ -33,6 +33,7 @@ class Window:
             event_timer_add=lambda *_, **__: "timer",
             event_timer_remove=lambda *_: None,
             modal_handler_add=lambda *_: True,
+            windows=[self.window],
         )
         self.workspace = SimpleNamespace(status_text_set=self.status.append)
 
