@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from gimp3d.box import Box, box_from_matrix
 from gimp3d.camera import Camera, Distortion, output_name
@@ -281,9 +281,11 @@ class ViewSize:
     width: int  # pixels
     height: int
     photo: bool
+    strange_photo: bool  # has one that may not be used
+    sees: bool  # a part of the boxes may be in its picture; always so of an animation's frames
 
 
-def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
+def view_sizes(context: bpy.types.Context, boxes: Iterable[bpy.types.Object] = ()) -> list[ViewSize]:
     """Of the views that `views_of` would give, without going through an animation's frames.
 
     Raises
@@ -301,7 +303,34 @@ def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
         if obj.data.type != "PERSP":
             raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
     animated = settings.views == "ANIMATED"
-    return [ViewSize(*own_size(obj, scene), has_photo(obj) and not animated) for obj in cameras] * times
+    corners = [np.array([b.matrix_world @ Vector(c) for c in b.bound_box]) for b in boxes]
+    return [
+        ViewSize(
+            *own_size(obj, scene),
+            has_photo(obj) and not animated,
+            has_strange_photo(obj) and not animated,
+            animated or not corners or any(_may_see(obj, scene, c) for c in corners),
+        )
+        for obj in cameras
+    ] * times
+
+
+def _may_see(
+    obj: bpy.types.Object,
+    scene: bpy.types.Scene,
+    corners: np.ndarray,  # [8, 3] of a box, world
+) -> bool:
+    """Whether a box is not wholly behind the camera, or beyond one side of its picture."""
+    x, y, z = (corners @ np.array(obj.matrix_world.inverted().to_3x3()).T + obj.matrix_world.inverted().translation).T
+    frame = [Vector(c) for c in obj.data.view_frame(scene=scene)]  # corners of the picture, z < 0
+    left, right = (pick(c.x / -c.z for c in frame) for pick in (min, max))
+    low, high = (pick(c.y / -c.z for c in frame) for pick in (min, max))
+    stored, depth = imported(obj), -z
+    if stored is not None:  # whose picture is not the scene's
+        left, right = -stored.cx / stored.fx, (stored.width - stored.cx) / stored.fx
+        low, high = (stored.cy - stored.height) / stored.fy, stored.cy / stored.fy
+    beyond = (depth <= 0, x < left * depth, x > right * depth, y < low * depth, y > high * depth)
+    return not any(side.all() for side in beyond)
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:

@@ -269,7 +269,7 @@ def python_of(context: bpy.types.Context) -> str:
     """
     chosen = preferences(context)
     python = chosen.python if chosen else ""
-    if python and not Path(python).is_absolute():
+    if python.startswith("//") or (python and not Path(python).is_absolute()):
         raise BadInput(f"the Python {python!r} in the preferences of 3D-GIMP must be a full path; choose it again")
     return python
 
