@@ -126,7 +126,8 @@ def own_size(obj: bpy.types.Object, scene: bpy.types.Scene) -> tuple[int, int]:
 def imported(obj: bpy.types.Object) -> Camera | None:
     """The camera that an object was imported as; None for the user's own.
 
-    Checked here once: the property came with the .blend, and may hold anything. Its photo may lie anywhere: see `photo_of`.
+    Checked here once: the property came with the .blend, and may hold anything. Its photo may lie anywhere, see
+    `photo_of`.
 
     Raises
     ------

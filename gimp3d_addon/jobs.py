@@ -108,7 +108,7 @@ def unfinished(context: bpy.types.Context) -> Path | None:
 
 
 def of_file(context: bpy.types.Context) -> list[Record]:
-    """The jobs of the open file that are still there, oldest first. Those from before its first save are its scenes'."""
+    """The jobs of the open file that are still there, oldest first; also those from before its first save."""
     ids = {s.gimp3d.id for s in bpy.data.scenes}
     mine = (r for r in _records() if r.scene in ids and r.blend in ("", bpy.data.filepath))
     return sorted((r for r in mine if Path(r.folder).is_dir()), key=lambda r: r.started)
@@ -118,6 +118,11 @@ def record_of(folder: Path) -> Record | None:
     """What is known of a job; None if this machine did not write it."""
     here = str(folder.resolve())
     return next((r for r in _records() if r.folder == here), None)
+
+
+def is_first() -> bool:
+    """Whether no job of this machine is known, so that its kernels may have to be compiled."""
+    return not _records()
 
 
 def is_own_report(path: Path) -> bool:
@@ -266,9 +271,9 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
 
 
 def share_scene(folder: Path) -> None:
-    """Let the job's scene be the same file as another job's, where they are alike to the byte: scenes are large."""
-    scene = folder / "scene.ply"
-    others = (Path(r.folder, name) for r in _records() for name in ("scene.ply", "out.ply"))
+    """Let the job's scene be the same file as that of a job beside it, where they are alike to the byte."""
+    scene, beside = folder / "scene.ply", (Path(r.folder) for r in _records())
+    others = (b / name for b in beside if b.parent == folder.resolve().parent for name in ("scene.ply", "out.ply"))
     for other in others:
         with suppress(OSError):  # gone, or on another disk, or one without links
             if other.samefile(scene):

@@ -24,7 +24,8 @@ def hold(path: Path | str, patience: float = 0.0) -> IO[bytes] | None:
 
     Where a disk knows no locks, nothing is locked.
     """
-    file, until = open(path, "ab"), time.monotonic() + patience
+    file = open(path, "ab")  # noqa: SIM115, it is open for as long as it is locked
+    until = time.monotonic() + patience
     while True:
         try:
             if os.name == "nt":

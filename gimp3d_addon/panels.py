@@ -14,7 +14,7 @@ from .operators.base import RunsChild, current_splat
 from .operators.display import unfit_settings
 from .operators.remove import source_in
 from .operators.roi import FITS, proposed
-from .worker import duration
+from .worker import COMPILING, duration
 
 LINE = 38  # characters that fit into the panel's default width
 
@@ -210,6 +210,8 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
         if missing is None and told is not None:
             cost = f"about {duration(told.seconds * settings.pace)}, {told.memory_mb / 1000:.1f} GB"
             layout.label(text=cost, icon="TIME")
+            if jobs.is_first():
+                layout.label(text=f"On a first run {duration(COMPILING)} more", icon="INFO")
             if settings.hole:
                 layout.label(text=f"Hole: {settings.hole}", icon="MOD_MASK")
         if missing is not None:

@@ -146,7 +146,8 @@ class GIMP3D_preferences(bpy.types.AddonPreferences):
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        from .operators.environment import USES, GIMP3D_OT_check  # it needs this module
+        from . import trust  # they need this module
+        from .operators.environment import USES, GIMP3D_OT_check, verdict
 
         layout = self.layout
         layout.label(text="Remove runs in a Python of its own, so that Blender stays free.")
@@ -156,8 +157,15 @@ class GIMP3D_preferences(bpy.types.AddonPreferences):
         row.operator("gimp3d.check", icon="CHECKMARK")
         for name, version in GIMP3D_OT_check.found.items():
             there = bool(version) and not version.startswith("broken")
-            text = f"{name} {version or 'missing'}" + (f", {USES[name]}" if name in USES else "")
-            layout.label(text=text, icon="CHECKMARK" if there else "INFO" if name in USES else "ERROR")
+            words = (f"{name} {version or 'missing'}", USES.get(name, ""), verdict(name))
+            icon = "CHECKMARK" if there else "INFO" if name in USES else "ERROR"
+            layout.label(text=", ".join(w for w in words if w), icon=icon)
+        for number, said in enumerate(trust.allowed()):
+            row = layout.row()
+            column = row.column(align=True)
+            for line in said.splitlines():
+                column.label(text=line, icon="BLANK1" if line != said.splitlines()[0] else "CHECKBOX_HLT")
+            row.operator("gimp3d.forget_allowed", text="Ask Again").index = number
 
 
 CLASSES = (GIMP3D_PG_region, GIMP3D_PG_settings, GIMP3D_preferences)

@@ -13,10 +13,10 @@ from gimp3d.errors import BadInput
 from gimp3d.forecast import Forecast, forecast_removal
 
 from . import bridge, splats
+from .bridge import present
 from .operators.base import current_boxes, current_splat
 
 FEW_VIEWS = 3  # below it hardly anything behind the object is seen
-MOST = 0.5  # of the splats: a box that holds more is hardly round one object
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,16 @@ def region_step(context: bpy.types.Context) -> Step:
         return Step(missing=str(error))
     if inside == 0:
         return Step(missing="The box holds no splat; move it", fixes=(here,))
-    share = inside / splats.count(splat)
-    facts = (f"{inside:,} splats inside", f"{share:.1%} of the scene")
-    if share > MOST:
-        return Step(facts, warning=f"{boxes[0].name} holds most of the scene: is it round the object?", fixes=(here,))
+    facts = (f"{inside:,} splats inside", f"{inside / splats.count(splat):.1%} of the scene")
+    if not any(present(context.scene, r.object) for r in context.scene.gimp3d.rois):
+        said = f"Nobody chose {boxes[0].name} as the box; as the active mesh it counts"
+        return Step(facts, warning=said, fixes=(here, Fix("gimp3d.use_selected", "Use Selected as Boxes")))
     return Step(facts)
 
 
 def views_step(context: bpy.types.Context) -> Step:
+    if current_splat(context) is None:
+        return Step(missing="Import the scene first")
     add = (Fix("gimp3d.add_views", "Orbit round the Box"), Fix("gimp3d.import_cameras", "Import Cameras"))
     boxes = current_boxes(context)
     try:
@@ -84,14 +86,16 @@ def views_step(context: bpy.types.Context) -> Step:
         return Step(missing="No view yet", fixes=add)
     photos, strange = sum(v.photo for v in found), sum(v.strange_photo for v in found)
     seeing = sum(v.sees for v in found)
-    counted = f"{len(found)} views" if seeing == len(found) else f"{seeing} of {len(found)} views see the box"
+    counted = f"{len(found)} view{'s' if len(found) > 1 else ''}"
+    if seeing < len(found):
+        counted = f"{seeing} of {counted} see the box"
     facts = (counted, f"{photos} with photo" if photos else "drawn from the splats")
     hint = f"{strange} photos are not where you took photos from: import the cameras again" if strange else ""
     if seeing == 0:
         return Step(facts, missing="No view sees the box", fixes=add)
     if seeing < FEW_VIEWS:
-        few = "Only one view sees" if seeing == 1 else f"Only {seeing} views see"
-        return Step(facts, warning=f"{few} the box: much of what is behind it will be invented", fixes=add, hint=hint)
+        few = f"Only {seeing} view{'s' if seeing > 1 else ''}: much of what is behind the object will be invented"
+        return Step(facts, warning=few, fixes=add, hint=hint)
     return Step(facts, hint=hint)
 
 

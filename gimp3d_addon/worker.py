@@ -69,6 +69,9 @@ def own_python() -> str:
     return found
 
 
+# s that the kernels take on a first run: the demo's takes 68 s of processor time, and 13 s from then on. That run's
+# speed says nothing of what is left
+COMPILING = 55.0
 GIVE_WAY = 10  # how much nicer than Blender a child is, so that drawing does not wait for a core
 
 
@@ -171,6 +174,9 @@ class Worker:
         """What to show: the stage and, of a removal, the time left."""
         if self._clock is None or self.summary is not None:
             return self.status
+        if self.compiled:
+            left = (1 - self._clock.fraction) * (self._clock.forecast.seconds * pace + COMPILING)
+            return f"{self.status} · about {duration(left)} left (compiling: first run only)"
         left = self._clock.seconds_left(time.monotonic() - self._started, pace)
         return f"{self.status} · about {duration(left)} left"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty
+from bpy.props import BoolProperty, IntProperty
 
 from gimp3d.errors import BadInput, Gimp3dError
 
@@ -196,7 +196,8 @@ class AsksFirst(RunsChild):
             if strange and not self.allow_command:
                 what = "; ".join(strange).replace("\n", ", ")
                 raise BadInput(
-                    f"nobody has allowed this on this machine: {what}; Remove Object asks, a script gives allow_command=True"
+                    f"nobody has allowed this on this machine: {what}; "
+                    "Remove Object asks, a script gives allow_command=True"
                 )
         except FAILURES as error:
             return self._failed(error)
@@ -274,7 +275,21 @@ def python_of(context: bpy.types.Context) -> str:
     return python
 
 
-CLASSES = (GIMP3D_OT_cancel,)
+class GIMP3D_OT_forget_allowed(bpy.types.Operator):
+    """Ask again before this is run"""
+
+    bl_idname = "gimp3d.forget_allowed"
+    bl_label = "Ask Again"
+
+    index: IntProperty(name="Index", min=0)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        for said in trust.allowed()[self.index : self.index + 1]:
+            trust.forget(said)
+        return {"FINISHED"}
+
+
+CLASSES = (GIMP3D_OT_cancel, GIMP3D_OT_forget_allowed)
 
 
 def light_words(shadow: dict[str, Any], reflection: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ from gimp3d.io.ply import write_ply
 
 from .. import jobs, splats
 from .base import ReportsErrors, current_splat, link, select_only
+from .display import show_imported
 
 UP_ITEMS = (
     ("FILE", "As in the file", "Keep the file's axes"),
@@ -49,7 +50,10 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
         link(context, obj)
         jobs.identify(context.scene, obj)
         select_only(context, obj)
+        obj.select_set(False)  # still the active one; the outline of so many points would hide them
         context.scene.gimp3d.splat = obj
+        if not bpy.app.background:
+            show_imported(context, obj)
         self.report({"INFO"}, f"{len(file.gaussians):,} Gaussians, SH degree {file.gaussians.sh_degree}")
 
 

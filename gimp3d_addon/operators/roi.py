@@ -54,6 +54,7 @@ class GIMP3D_OT_add_roi(ReportsErrors, bpy.types.Operator):
         mesh.from_pydata(corners, [], faces)
         box = bpy.data.objects.new("Remove this", mesh)
         box.display_type, box.hide_render = "WIRE", True
+        box.show_in_front = True  # splats would hide it
         box.matrix_world = matrix
         link(context, box)
         context.scene.gimp3d.rois.add().object = box

@@ -23,7 +23,6 @@ from gimp3d_addon.operators.base import AsksFirst, RunsChild
 from gimp3d_addon.operators.remove import RunsRemoval
 from gimp3d_addon.properties import user_folder
 
-
 SIZE = (120, 90)
 
 
@@ -63,7 +62,7 @@ def test_an_id_that_leads_out_of_the_job_is_refused_before_anything_is_written(
     trust.know_photos([tmp_path / "payload.png"])
     spoil(a_view(), id=name, image=str(tmp_path / "payload.png"))
     before = files_below(tmp_path)
-    with pytest.raises(RuntimeError, match="gimp3d: error: .*camera"):
+    with pytest.raises(RuntimeError, match=r"gimp3d: error: .*camera"):
         bpy.ops.gimp3d.remove_object()
     with pytest.raises(BadInput):
         jobs.write_job(bpy.context, tmp_path / "job")
@@ -110,7 +109,7 @@ def test_photos_are_copied_only_from_where_the_user_took_some(splat: bpy.types.O
 )
 def test_damaged_camera_data_is_one_line_and_the_panel_says_it(splat: bpy.types.Object, stored: object) -> None:
     a_view()[bridge.CAMERA] = stored
-    with pytest.raises(RuntimeError, match="gimp3d: error: camera orbit/000: .*import the cameras again"):
+    with pytest.raises(RuntimeError, match=r"gimp3d: error: camera orbit/000: .*import the cameras again"):
         bpy.ops.gimp3d.remove_object()
     assert "orbit/000" in steps.views_step(bpy.context).missing
 
@@ -157,7 +156,7 @@ def test_a_command_of_the_file_is_refused_without_a_window(
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"), use_scripts=False)
     operators = [bpy.ops.gimp3d.remove_object, *([bpy.ops.gimp3d.preview_masks] if setting == "depth_prior" else [])]
     for operator in operators:
-        with pytest.raises(RuntimeError, match="gimp3d: error: nobody has allowed this .*trace"):
+        with pytest.raises(RuntimeError, match=r"gimp3d: error: nobody has allowed this .*trace"):
             operator()
     assert not command[1].exists() and not (tmp_path / "gimp3d_jobs").exists()
 
