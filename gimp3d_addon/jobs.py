@@ -23,7 +23,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob, save_job, write_atomically
 
-from . import backdrops, bridge, splats
+from . import backdrops, bridge, splats, trust
 from .lock import is_held
 from .operators.base import current_boxes, current_splat
 from .properties import user_folder
@@ -112,6 +112,13 @@ def of_file(context: bpy.types.Context) -> list[Record]:
     ids = {s.gimp3d.id for s in bpy.data.scenes}
     mine = (r for r in _records() if r.scene in ids and r.blend in ("", bpy.data.filepath))
     return sorted((r for r in mine if Path(r.folder).is_dir()), key=lambda r: r.started)
+
+
+def of_lost_files() -> list[Record]:
+    """Jobs whose .blend is gone, or was never saved and is a day old: nobody else would ever delete them."""
+    ids, yesterday = {s.gimp3d.id for s in bpy.data.scenes}, time.time() - 86400
+    there = (r for r in _records() if r.scene not in ids and Path(r.folder).is_dir())
+    return [r for r in there if (not Path(r.blend).exists() if r.blend else r.started < yesterday)]
 
 
 def record_of(folder: Path) -> Record | None:
@@ -227,8 +234,8 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
             reference = camera.id
     painted = settings.reference_paint
     picture = bpy.path.abspath(settings.reference_image) if settings.reference_image and painted is None else ""
-    if picture and not Path(picture).is_file():
-        raise BadInput(f"the reference picture {picture} does not exist")
+    if picture and not trust.is_known_photo(Path(picture)):
+        raise BadInput(f"the reference picture {picture} does not exist, or this file brought it along; load it again")
     if (picture or painted is not None) and not reference:
         raise BadInput("a reference picture needs its camera; choose the reference view")
     shaded = next((camera for camera, obj in views if obj == settings.shadow_camera), None)
@@ -244,7 +251,7 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     write_transforms(folder / "transforms.json", [_with_photo(c, folder / PHOTOS) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
-        shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")
+        shutil.copyfile(picture, folder / f"reference{Path(picture).suffix}")
     if painted is not None:
         picture = str(folder / "reference.png")
         painted.save(filepath=picture, save_copy=True)

@@ -286,6 +286,12 @@ class GIMP3D_PT_jobs(Advanced, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, found = self.layout, jobs.of_file(context)
+        lost = jobs.of_lost_files()
+        if lost:
+            layout.label(
+                text=f"{len(lost)} jobs of files that are gone · {jobs.size(lost) / 1e6:,.0f} MB", icon="GHOST_DISABLED"
+            )
+            layout.operator("gimp3d.delete_jobs", text="Delete Them").lost = True
         if not found:
             layout.label(text="None of this file", icon="INFO")
             return

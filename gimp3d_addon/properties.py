@@ -43,6 +43,14 @@ class GIMP3D_PG_region(bpy.types.PropertyGroup):
     object: PointerProperty(type=bpy.types.Object, name="Box")
 
 
+def _know_picture(settings: GIMP3D_PG_settings, _: bpy.types.Context) -> None:
+    """Called when the user or a script chooses a picture, and not for what a .blend brings along."""
+    from . import trust  # it needs this module
+
+    if settings.reference_image:
+        trust.know_photos([Path(bpy.path.abspath(settings.reference_image))])
+
+
 class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     """What a removal needs, kept with the scene."""
 
@@ -72,6 +80,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         name="Picture",
         description="The reference view without the object, painted in any tool",
         subtype="FILE_PATH",
+        update=_know_picture,
     )
     grow: BoolProperty(
         name="Grow",

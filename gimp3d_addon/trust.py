@@ -59,17 +59,19 @@ def forget(said: str) -> None:
 
 
 def know_photos(photos: Iterable[Path]) -> None:
-    """The user chose these photos; what lies in their folders may go into jobs."""
+    """The user chose these pictures; what lies in their folders may go into jobs."""
     known = _read(PHOTO_FOLDERS)
-    new = dict.fromkeys(str(photo.resolve().parent) for photo in photos)
+    new = dict.fromkeys(str(path.parent) for photo in photos for path in (photo.absolute(), photo.resolve()))
     if not new.keys() <= set(known):
         _write(PHOTO_FOLDERS, list(dict.fromkeys([*known, *new])))
 
 
 def is_known_photo(path: Path) -> bool:
-    """Whether a file is a photo by its name and lies, links followed, in a folder that the user took photos from."""
+    """Whether a file is named as a picture and lies, links followed, in a folder that the user took pictures from."""
     known = _read(PHOTO_FOLDERS)
-    if path.suffix.lower() not in PHOTOS or str(path.parent) not in known:  # before the disk, or a network, is asked
+    if (
+        path.suffix.lower() not in PHOTOS or str(path.absolute().parent) not in known
+    ):  # before the disk, or a network, is asked
         return False
     return str(path.resolve().parent) in known and path.is_file()
 

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import bpy
-from bpy.props import IntProperty, StringProperty
+from bpy.props import BoolProperty, IntProperty, StringProperty
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput, Gimp3dError
@@ -239,14 +239,19 @@ class GIMP3D_OT_delete_jobs(ReportsErrors, bpy.types.Operator):
     bl_label = "Delete Old Jobs"
 
     folder: StringProperty(name="Folder", description="Of one job; empty: all", options={"SKIP_SAVE"})
+    lost: BoolProperty(
+        name="Of Lost Files", description="Those whose .blend is gone, instead of this file's", options={"SKIP_SAVE"}
+    )
     keep: IntProperty(name="Keep", default=1, min=0, description="How many of the newest stay", options={"SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)
 
     def work(self, context: bpy.types.Context) -> None:
-        known = jobs.of_file(context)
-        if self.folder:
+        known = jobs.of_lost_files() if self.lost else jobs.of_file(context)
+        if self.lost:
+            chosen = known
+        elif self.folder:
             chosen = [r for r in known if r.folder == self.folder]
         else:
             chosen = known[: len(known) - self.keep]

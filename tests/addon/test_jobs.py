@@ -202,5 +202,16 @@ def test_old_jobs_are_deleted_and_the_newest_stays(splat: bpy.types.Object, tmp_
     assert jobs.of_file(bpy.context) == [] and strange.exists()
 
 
+def test_jobs_of_files_that_are_gone_can_be_deleted(splat: bpy.types.Object, tmp_path: Path) -> None:
+    folder = stopped(splat)
+    another_file(tmp_path / "other.blend", tmp_path)
+    assert folder not in [Path(r.folder) for r in jobs.of_lost_files()]
+    (tmp_path / "work.blend").unlink()
+    assert folder in [Path(r.folder) for r in jobs.of_lost_files()]
+    kept = jobs.new_job_folder("mine")
+    assert bpy.ops.gimp3d.delete_jobs(lost=True) == {"FINISHED"}
+    assert not folder.exists() and kept.exists() and jobs.of_lost_files() == []
+
+
 def test_two_blenders_never_take_the_same_folder(splat: bpy.types.Object) -> None:
     assert jobs.new_job_folder("a") != jobs.new_job_folder("a")

@@ -371,6 +371,20 @@ def test_a_job_that_cannot_be_written_leaves_no_folder(splat: bpy.types.Object, 
     assert not list((tmp_path / "gimp3d_jobs").iterdir())
 
 
+def test_a_reference_picture_that_the_file_brought_along_is_not_copied(splat: bpy.types.Object, tmp_path: Path) -> None:
+    """One that was chosen on this machine is, also from a saved file."""
+    picture = tmp_path / "pictures" / "clean.png"
+    write_png(picture, np.full((SIZE[1], SIZE[0], 3), 77, np.uint8))
+    bpy.ops.gimp3d.load_reference(filepath=str(picture))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "work.blend"), check_existing=False)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "work.blend"))
+    assert jobs.write_job(bpy.context, tmp_path / "job").reference_image.endswith("reference.png")
+    (user_folder("trusted") / trust.PHOTO_FOLDERS).unlink()  # as on another machine
+    with pytest.raises(BadInput, match="brought it along; load it again"):
+        jobs.write_job(bpy.context, tmp_path / "job2")
+    assert not (tmp_path / "job2").exists()
+
+
 def test_the_photos_of_a_job_move_with_it(splat: bpy.types.Object, tmp_path: Path) -> None:
     write_png(tmp_path / "orbit" / "000.png", np.full((SIZE[1], SIZE[0], 3), 77, np.uint8))
     bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
