@@ -99,12 +99,11 @@ def source_in(scene: bpy.types.Scene, record: Record) -> bpy.types.Object | None
 
 
 def unfinished(context: bpy.types.Context) -> Path | None:
-    """The newest stopped job of this scene in this file, unless a process is at work on it."""
-    for record in reversed(of_file(context)):
-        folder = Path(record.folder)
-        if record.open and _of_scene(context.scene, record) and _is_unchanged(record) and not is_held(folder / LOCK):
-            return folder
-    return None
+    """The last job of this scene in this file, if it was stopped and no process is at work on it."""
+    last = next((r for r in reversed(of_file(context)) if _of_scene(context.scene, r)), None)
+    if last is None or not last.open or not _is_unchanged(last) or is_held(Path(last.folder) / LOCK):
+        return None
+    return Path(last.folder)
 
 
 def of_file(context: bpy.types.Context) -> list[Record]:

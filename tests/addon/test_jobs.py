@@ -79,6 +79,13 @@ def test_a_job_from_before_the_first_save_stays_with_its_scene(
     assert jobs.unfinished(bpy.context) is None
 
 
+def test_a_stopped_job_is_not_offered_once_a_later_one_has_ended(splat: bpy.types.Object) -> None:
+    first, second = stopped(splat), stopped(splat)
+    assert jobs.unfinished(bpy.context) == second and first != second
+    jobs.close(second)
+    assert jobs.unfinished(bpy.context) is None
+
+
 def test_a_job_stays_with_its_scene_within_a_file(splat: bpy.types.Object) -> None:
     folder, first = stopped(splat), bpy.context.scene
     copy = first.copy()
