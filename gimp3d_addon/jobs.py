@@ -76,7 +76,8 @@ def open_for(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) 
 
 
 def close(folder: Path) -> None:
-    """The job's result is in the scene, or there will be none."""
+    """The job's result is in the scene, or there will be none: what it could be resumed from is of no more use."""
+    shutil.rmtree(folder / "stages", ignore_errors=True)
     record = record_of(folder)
     if record is not None:
         _write(replace(record, open=False))

@@ -68,8 +68,7 @@ def region_step(context: bpy.types.Context) -> Step:
         return Step(missing="The box holds no splat; move it", fixes=(here,))
     facts = (f"{inside:,} splats inside", f"{inside / splats.count(splat):.1%} of the scene")
     if not any(present(context.scene, r.object) for r in context.scene.gimp3d.rois):
-        said = f"Nobody chose {boxes[0].name} as the box; as the active mesh it counts"
-        return Step(facts, warning=said, fixes=(here, Fix("gimp3d.use_selected", "Use Selected as Boxes")))
+        return Step(facts, warning=f"The active mesh, {boxes[0].name}, counts as the box", fixes=(here,))
     return Step(facts)
 
 

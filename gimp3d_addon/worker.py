@@ -177,6 +177,8 @@ class Worker:
         if self.compiled:
             left = (1 - self._clock.fraction) * (self._clock.forecast.seconds * pace + COMPILING)
             return f"{self.status} · about {duration(left)} left (compiling: first run only)"
+        if self._clock.fraction == 0:  # whether it has to compile is said after reading
+            return self.status
         left = self._clock.seconds_left(time.monotonic() - self._started, pace)
         return f"{self.status} · about {duration(left)} left"
 

@@ -21,6 +21,7 @@ from ..worker import Worker
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
 AGAIN = {"PASS_THROUGH"}  # another child follows
+LONGEST = 1500  # characters of what a dialogue can show in full
 TICK = 0.1  # s between two looks at the child's progress
 
 
@@ -171,11 +172,21 @@ class AsksFirst(RunsChild):
         return settings.inpaint, settings.depth_prior
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        self._shown = tuple(trust.unconfirmed(self.providers(context)))
+        try:
+            self._shown = tuple(trust.unconfirmed(self.providers(context)))
+            if sum(map(len, self._shown)) > LONGEST:
+                raise BadInput("the settings Fill and Surface are too long to be shown, so they cannot be allowed")
+        except FAILURES as error:
+            self._shown = ()
+            return self._failed(error)
         if not self._shown or bpy.app.background:
             return self.execute(context)
         return context.window_manager.invoke_props_dialog(
-            self, width=560, title="This file asks to run something on your machine", confirm_text="Allow and Run"
+            self,
+            width=560,
+            title="This file asks to run something on your machine",
+            confirm_text="Allow and Run",
+            cancel_default=True,
         )
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -183,7 +194,8 @@ class AsksFirst(RunsChild):
         column = self.layout.column(align=True)
         for said in self._shown:
             for line in said.splitlines():
-                for part in textwrap.wrap(line, 80, replace_whitespace=False, drop_whitespace=False):
+                plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in line)  # nothing turns it round
+                for part in textwrap.wrap(plain, 80, drop_whitespace=False):
                     column.label(text=part)
             column.separator()
         column.label(text="Allow it only if you know it. The preferences list what you allowed.", icon="ERROR")

@@ -200,9 +200,9 @@ def test_what_a_new_file_holds_ticks_no_step(tmp_path: Path) -> None:
     bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "scene.ply"))
     assert steps.region_step(bpy.context).missing and steps.views_step(bpy.context).warning
     bpy.context.view_layer.objects.active = bpy.data.objects["Cube"]
-    assert "Nobody chose Cube" in steps.region_step(bpy.context).warning
+    assert "The active mesh, Cube" in steps.region_step(bpy.context).warning
     log = drawn()
-    assert "Nobody chose Cube as the box" in " ".join(log) and "Only 1 view: much" in " ".join(log)
+    assert "The active mesh, Cube, counts" in " ".join(log) and "Only 1 view: much" in " ".join(log)
     below = log[log.index("grow") - 12 : log.index("grow")]  # beside the button, with the way out
     assert "gimp3d.add_views" in below and "gimp3d.add_roi" in below
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from pathlib import Path
 
@@ -84,7 +83,7 @@ def test_blender_and_the_shell_give_the_same_bytes(folder: Path, up: str | None)
     assert json.loads((job / "roi.json").read_text()) == [told]
     assert (folder / "blender.ply").read_bytes() == shell(folder, "shell.ply")
     (job / "out.ply").unlink()
-    shutil.rmtree(job / "stages")
+    assert not (job / "stages").exists()  # nothing to go on from, and most of the folder's size
     assert main(["remove", "--job", str(job), "--progress", "none"]) == 0
     assert (job / "out.ply").read_bytes() == (folder / "shell.ply").read_bytes()
 

@@ -262,6 +262,18 @@ def test_the_window_shows_a_command_in_full_and_asks_once_on_a_machine(
     assert trust.unconfirmed([long])
 
 
+def test_what_cannot_be_shown_cannot_be_allowed(splat: bpy.types.Object, window: Callable[[], Dialog]) -> None:
+    """Neither by its length nor by characters that turn the line round or break it."""
+    bpy.context.scene.gimp3d.inpaint = "command:harmless " + " " * 5000 + "rm -rf / {out}"
+    pressed = window()
+    assert pressed.operator.ask(pressed, None) == {"CANCELLED"} and pressed.asked == 0
+    assert "too long to be shown" in pressed.errors[-1] and trust.allowed() == []
+    bpy.context.scene.gimp3d.inpaint = "command:a \u202e b {out}"
+    pressed = window()
+    pressed.operator.ask(pressed, None)
+    assert "command:a \\u202e b {out}" in pressed.lines
+
+
 def test_what_was_allowed_is_in_the_users_folder_and_not_in_the_blend(
     splat: bpy.types.Object, tmp_path: Path, command: tuple[str, Path]
 ) -> None:
