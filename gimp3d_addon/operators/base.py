@@ -113,7 +113,9 @@ class RunsChild:
         return answer
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: another file is opened, or the window closes."""
+        """Blender ends the operator: another file is opened, the window closes, or a dialogue before it was cancelled."""
+        if RunsChild.running is not self:
+            return
         self.worker.cancel()
         self._stop(context)
         self.tidy()

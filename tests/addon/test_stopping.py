@@ -208,7 +208,10 @@ def test_opening_another_file_ends_the_run(splat: bpy.types.Object) -> None:
     class Pressed(RunsRemoval):
         worker, _timer = running, "timer"
 
-    Pressed().cancel(Window())
+    RunsChild.running = Pressed()
+    Pressed().cancel(Window())  # one whose dialogue was cancelled: it runs nothing
+    assert running._process.poll() is None and RunsChild.running is not None
+    RunsChild.running.cancel(Window())
     assert running._process.poll() is not None and RunsChild.running is None
 
 
