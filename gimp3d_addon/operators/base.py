@@ -113,7 +113,7 @@ class RunsChild:
         return answer
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: another file is opened, the window closes, or a dialogue before it was cancelled."""
+        """Blender ends the operator: another file is opened, the window closes, or its dialogue was cancelled."""
         if RunsChild.running is not self:
             return
         self.worker.cancel()
