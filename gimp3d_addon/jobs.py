@@ -46,6 +46,7 @@ class Record:
     source_name: str
     matrix: tuple[tuple[float, ...], ...]  # the object's, for where it is lost
     started: float  # s since 1970
+    providers: tuple[str, ...]  # the job's own: the scene may name others by now
     open: bool = True  # its result is still to come
 
 
@@ -68,11 +69,12 @@ def new_job_folder(name: str) -> Path:
 
 
 def open_for(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> None:
-    """Note in this user's own record what a job belongs to, and that its result is still to come."""
+    """Note in this user's own record what a job, just written, belongs to, and that its result is still to come."""
     identify(context.scene, splat)
     settings, matrix = context.scene.gimp3d, tuple(tuple(row) for row in splat.matrix_world)
     owner = (bpy.data.filepath, settings.id, context.scene.name, splat[splats.ID], splat.name)
-    _write(Record(str(folder.resolve()), _digest(folder), *owner, matrix, time.time()))
+    providers = (settings.inpaint, settings.depth_prior)
+    _write(Record(str(folder.resolve()), _digest(folder), *owner, matrix, time.time(), providers))
 
 
 def close(folder: Path) -> None:

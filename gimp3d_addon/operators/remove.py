@@ -13,7 +13,6 @@ from mathutils import Matrix
 from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
-from gimp3d.job import load_job
 
 from .. import charts, jobs, splats, steps
 from ..bridge import present
@@ -139,10 +138,8 @@ class GIMP3D_OT_resume(RunsRemoval, bpy.types.Operator):
     def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
         """The job's own, which may not be the scene's any more."""
         folder = jobs.unfinished(context)
-        if folder is None:
-            return ()
-        job = load_job(folder)
-        return job.inpaint, job.depth_prior
+        record = jobs.record_of(folder) if folder is not None else None
+        return tuple(record.providers) if record is not None else ()
 
     def start(self, context: bpy.types.Context) -> Worker:
         folder = jobs.unfinished(context)
