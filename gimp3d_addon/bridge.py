@@ -10,15 +10,19 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from gimp3d.box import Box, box_from_matrix
-from gimp3d.camera import Camera, Distortion
+from gimp3d.camera import Camera, Distortion, output_name
 from gimp3d.errors import BadInput
+from gimp3d.io.cameras import make_camera, rigid
+
+from . import trust
 
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
@@ -87,16 +91,15 @@ def camera_from_blender(
     to_local = np.eye(4)
     to_local[:3, :3], to_local[:3, 3] = rotation, local[:3, 3]
     viewmat = np.linalg.inv(to_local @ BLENDER_TO_OPENCV)
-    if CAMERA in obj:
-        stored = json.loads(obj[CAMERA])
-        distortion = Distortion(*stored["distortion"]) if stored["distortion"] else None
-        imported = np.array(stored["viewmat"])
-        there = name is None and not _moved(viewmat, imported, frame)
-        viewmat = imported if there else viewmat  # to the last bit, which Blender's float32 does not keep
-        image = Path(stored["image"]) if stored["image"] and there else None
-        size = (stored["width"], stored["height"])
-        intrinsics = (stored["fx"], stored["fy"], stored["cx"], stored["cy"])
-        return Camera(name or stored["id"], *size, *intrinsics, viewmat, stored["split"], image, distortion)
+    stored = imported(obj)
+    if stored is not None:
+        there = name is None and not _moved(viewmat, stored.viewmat, frame)
+        return replace(
+            stored,
+            id=name or stored.id,
+            viewmat=stored.viewmat if there else viewmat,  # to the last bit, which Blender's float32 does not keep
+            image=photo_of(obj) if there else None,
+        )
     render = scene.render
     width, height = render_size(scene)
     p = obj.calc_matrix_camera(
@@ -116,26 +119,61 @@ def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
 
 def own_size(obj: bpy.types.Object, scene: bpy.types.Scene) -> tuple[int, int]:
     """Width and height of a camera's picture: an imported one has its own."""
-    if CAMERA not in obj:
-        return render_size(scene)
-    stored = json.loads(obj[CAMERA])
-    return stored["width"], stored["height"]
+    stored = imported(obj)
+    return render_size(scene) if stored is None else (stored.width, stored.height)
+
+
+def imported(obj: bpy.types.Object) -> Camera | None:
+    """The camera that an object was imported as; None for the user's own.
+
+    Checked here once: the property came with the .blend, and may hold anything. Its photo may lie anywhere, see
+    `photo_of`.
+
+    Raises
+    ------
+    BadInput
+        If it is damaged, or its ID leads out of the folders that files are named by it in.
+    """
+    return _stored(str(obj[CAMERA]), obj.name)[0] if CAMERA in obj else None
+
+
+@lru_cache(maxsize=4096)  # a panel asks many times a second
+def _stored(text: str, name: str) -> tuple[Camera, int]:
+    """The camera that a property describes, and its place in the file."""
+    where = f"camera {name}"
+    try:
+        stored = json.loads(text)
+        viewmat = np.array(stored["viewmat"], np.float64)
+        rigid(viewmat, where)  # a check: what is stored keeps its bits
+        distortion = Distortion(*map(float, stored["distortion"])) if stored["distortion"] else None
+        size, lens = (stored["width"], stored["height"]), tuple(stored[k] for k in ("fx", "fy", "cx", "cy"))
+        split, image = str(stored["split"]), Path(stored["image"]) if stored["image"] else None
+        return make_camera(where, stored["id"], viewmat, size, lens, distortion, split, image), int(stored["number"])
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, RecursionError):
+        raise BadInput(f"{where}: what is kept of its import is damaged; import the cameras again") from None
 
 
 def photo_of(obj: bpy.types.Object) -> Path | None:
-    """The photo that a camera was imported with."""
-    stored = json.loads(obj[CAMERA])["image"] if CAMERA in obj else None
-    return Path(stored) if stored else None
+    """The photo that a camera was imported with, if it lies where this user took photos from."""
+    stored = imported(obj)
+    found = stored is not None and stored.image is not None and trust.is_known_photo(stored.image)
+    return stored.image if found else None
 
 
 def has_photo(obj: bpy.types.Object) -> bool:
-    """Whether a camera was imported with a photo, even if it has been moved away from it since."""
+    """Whether a camera was imported with a photo that may be used, even if it has been moved away from it since."""
     return photo_of(obj) is not None
+
+
+def has_strange_photo(obj: bpy.types.Object) -> bool:
+    """Whether a camera names a photo where this user never took photos from, or that is gone."""
+    stored = imported(obj)
+    return stored is not None and stored.image is not None and not has_photo(obj)
 
 
 def is_chart(obj: bpy.types.Object | None) -> bool:
     """Whether a camera faces a chart: nothing can be seen from there but its picture, so it is no view."""
-    return obj is not None and CHART in obj
+    return obj is not None and isinstance(obj.get(CHART), int)
 
 
 def _moved(viewmat: np.ndarray, imported: np.ndarray, frame: np.ndarray) -> bool:
@@ -203,7 +241,7 @@ def box_from_blender(obj: bpy.types.Object, frame: np.ndarray) -> Box:
 def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:
     """The cameras that scene.gimp3d.views chooses, in the splat's frame, with the objects they come from.
 
-    No two have the same ID, though the same file may have been imported twice.
+    No two have the same ID or name their files alike, though the same file may have been imported twice.
 
     Raises
     ------
@@ -213,10 +251,10 @@ def views_of(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Ca
     taken: set[str] = set()
     for camera, obj in _chosen_views(context, frame):
         path, number, name = PurePosixPath(camera.id), 1, camera.id
-        while name in taken:
+        while output_name(name) in taken:
             number += 1
             name = str(path.with_name(f"{path.stem}_{number}{path.suffix}"))
-        taken.add(name)
+        taken.add(output_name(name))
         yield replace(camera, id=name), obj
 
 
@@ -244,9 +282,11 @@ class ViewSize:
     width: int  # pixels
     height: int
     photo: bool
+    strange_photo: bool  # has one that may not be used
+    sees: bool  # a part of the boxes may be in its picture; always so of an animation's frames
 
 
-def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
+def view_sizes(context: bpy.types.Context, boxes: Iterable[bpy.types.Object] = ()) -> list[ViewSize]:
     """Of the views that `views_of` would give, without going through an animation's frames.
 
     Raises
@@ -264,7 +304,34 @@ def view_sizes(context: bpy.types.Context) -> list[ViewSize]:
         if obj.data.type != "PERSP":
             raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
     animated = settings.views == "ANIMATED"
-    return [ViewSize(*own_size(obj, scene), has_photo(obj) and not animated) for obj in cameras] * times
+    corners = [np.array([b.matrix_world @ Vector(c) for c in b.bound_box]) for b in boxes]
+    return [
+        ViewSize(
+            *own_size(obj, scene),
+            has_photo(obj) and not animated,
+            has_strange_photo(obj) and not animated,
+            animated or not corners or any(_may_see(obj, scene, c) for c in corners),
+        )
+        for obj in cameras
+    ] * times
+
+
+def _may_see(
+    obj: bpy.types.Object,
+    scene: bpy.types.Scene,
+    corners: np.ndarray,  # [8, 3] of a box, world
+) -> bool:
+    """Whether a box is not wholly behind the camera, or beyond one side of its picture."""
+    x, y, z = (corners @ np.array(obj.matrix_world.inverted().to_3x3()).T + obj.matrix_world.inverted().translation).T
+    frame = [Vector(c) for c in obj.data.view_frame(scene=scene)]  # corners of the picture, z < 0
+    left, right = (pick(c.x / -c.z for c in frame) for pick in (min, max))
+    low, high = (pick(c.y / -c.z for c in frame) for pick in (min, max))
+    stored, depth = imported(obj), -z
+    if stored is not None:  # whose picture is not the scene's
+        left, right = -stored.cx / stored.fx, (stored.width - stored.cx) / stored.fx
+        low, high = (stored.cy - stored.height) / stored.fy, stored.cy / stored.fy
+    beyond = (depth <= 0, x < left * depth, x > right * depth, y < low * depth, y > high * depth)
+    return not any(side.all() for side in beyond)
 
 
 def chosen_cameras(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -285,7 +352,7 @@ def is_view(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> bool:
 
 
 def _number(obj: bpy.types.Object) -> int:
-    return json.loads(obj[CAMERA]).get("number", 0) if CAMERA in obj else 0
+    return _stored(str(obj[CAMERA]), obj.name)[1] if CAMERA in obj else 0
 
 
 def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Camera, bpy.types.Object]]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import filecmp
+import hashlib
 import json
+import os
 import shutil
+import time
+import uuid
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
@@ -18,67 +23,192 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob, save_job, write_atomically
 
-from . import backdrops, bridge, splats
+from . import backdrops, bridge, splats, trust
+from .lock import is_held
 from .operators.base import current_boxes, current_splat
-from .properties import GIMP3D_preferences
+from .properties import user_folder
 
 SHADOW_BEFORE = "shadow before"  # the view as it was before its shadow was painted over
-STATE = "blender.json"  # in a job's folder: what Blender wants back from it
+LOCK = "lock"  # in a job's folder: held by the process that works on it
+PHOTOS = "photos"  # in a job's folder
+
+
+@dataclass(frozen=True)
+class Record:
+    """A job that this machine wrote. It is kept in Blender's user folder: a folder beside a .blend may be anybody's."""
+
+    folder: str
+    digest: str  # SHA-256 of its job.json: another one was not written here
+    blend: str  # the file that it belongs to; empty: never saved then
+    scene: str  # ID of the scene
+    scene_name: str  # tells copies of a scene apart, which share the ID
+    source: str  # ID of the splat object
+    source_name: str
+    matrix: tuple[tuple[float, ...], ...]  # the object's, for where it is lost
+    started: float  # s since 1970
+    providers: tuple[str, ...]  # the job's own: the scene may name others by now
+    open: bool = True  # its result is still to come
 
 
 def jobs_folder() -> Path:
     """Beside the saved .blend, else in the extension's user folder: never where it dies with Blender."""
-    if bpy.data.filepath:
-        return Path(bpy.data.filepath).parent / "gimp3d_jobs"
-    package = GIMP3D_preferences.bl_idname
-    if package.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(package, path="jobs", create=True))
-    return Path(bpy.utils.user_resource("DATAFILES", path="gimp3d/jobs", create=True))
+    return Path(bpy.data.filepath).parent / "gimp3d_jobs" if bpy.data.filepath else user_folder("jobs")
 
 
 def new_job_folder(name: str) -> Path:
+    """A folder of its own, made now, so that another Blender takes another one."""
     clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "scene"
-    root = jobs_folder()
     number = 1
-    while (root / f"{clean}-{number:03d}").exists():
-        number += 1
-    return root / f"{clean}-{number:03d}"
+    while True:
+        folder = jobs_folder() / f"{clean}-{number:03d}"
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            number += 1
 
 
-def open_for(folder: Path, splat: bpy.types.Object) -> None:
-    """Note in a job's folder which object it is about, and that its result is still to come."""
-    _write_state(folder, {"source": splat.name, "matrix": [list(r) for r in splat.matrix_world], "open": True})
+def open_for(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> None:
+    """Note in this user's own record what a job, just written, belongs to, and that its result is still to come."""
+    identify(context.scene, splat)
+    settings, matrix = context.scene.gimp3d, tuple(tuple(row) for row in splat.matrix_world)
+    owner = (bpy.data.filepath, settings.id, context.scene.name, splat[splats.ID], splat.name)
+    providers = (settings.inpaint, settings.depth_prior)
+    _write(Record(str(folder.resolve()), _digest(folder), *owner, matrix, time.time(), providers))
 
 
 def close(folder: Path) -> None:
-    """The job's result is in the scene, or there will be none."""
-    _write_state(folder, {**_state(folder), "open": False})
+    """The job's result is in the scene, or there will be none: what it could be resumed from is of no more use."""
+    shutil.rmtree(folder / "stages", ignore_errors=True)
+    record = record_of(folder)
+    if record is not None:
+        _write(replace(record, open=False))
 
 
-def source_of(folder: Path) -> tuple[str, list[list[float]]]:
-    """The name and the matrix of the object that a job is about."""
-    state = _state(folder)
-    return state["source"], state["matrix"]
+def identify(scene: bpy.types.Scene, splat: bpy.types.Object) -> None:
+    """IDs of their own for the scene and the object; copies get new ones."""
+    settings = scene.gimp3d
+    if not settings.id or any(s != scene and s.gimp3d.id == settings.id for s in bpy.data.scenes):
+        settings.id = uuid.uuid4().hex
+    known = splat.get(splats.ID)
+    if not known or any(o != splat and o.get(splats.ID) == known for o in bpy.data.objects):
+        splat[splats.ID] = uuid.uuid4().hex
+
+
+def source_in(scene: bpy.types.Scene, record: Record) -> bpy.types.Object | None:
+    """The object that a job is about, if the scene still has it."""
+    found = [o for o in scene.objects if splats.is_splat(o) and o.get(splats.ID) == record.source]
+    return found[0] if len(found) == 1 else next((o for o in found if o.name == record.source_name), None)
 
 
 def unfinished(context: bpy.types.Context) -> Path | None:
-    """The last job of this scene, else the newest beside the file, if its result never came."""
-    known = context.scene.gimp3d.last_job
-    found = [Path(known)] if known else []
-    with suppress(OSError):
-        found += sorted(jobs_folder().iterdir(), key=lambda p: -p.stat().st_mtime)[:1]
-    return next((f for f in found if _state(f).get("open")), None)
+    """The last job of this scene in this file, if it was stopped and no process is at work on it."""
+    last = next((r for r in reversed(of_file(context)) if _of_scene(context.scene, r)), None)
+    if last is None or not last.open or not _is_unchanged(last) or is_held(Path(last.folder) / LOCK):
+        return None
+    return Path(last.folder)
 
 
-def _state(folder: Path) -> dict[str, Any]:
+def of_file(context: bpy.types.Context) -> list[Record]:
+    """The jobs of the open file that are still there, oldest first; also those from before its first save."""
+    ids = {s.gimp3d.id for s in bpy.data.scenes}
+    mine = (r for r in _records() if r.scene in ids and r.blend in ("", bpy.data.filepath))
+    return sorted((r for r in mine if Path(r.folder).is_dir()), key=lambda r: r.started)
+
+
+def of_lost_files() -> list[Record]:
+    """Jobs whose .blend is gone, or was never saved and is a day old: nobody else would ever delete them."""
+    ids, yesterday = {s.gimp3d.id for s in bpy.data.scenes}, time.time() - 86400
+    there = (r for r in _records() if r.scene not in ids and Path(r.folder).is_dir())
+    return [r for r in there if (not Path(r.blend).exists() if r.blend else r.started < yesterday)]
+
+
+def record_of(folder: Path) -> Record | None:
+    """What is known of a job; None if this machine did not write it."""
+    here = str(folder.resolve())
+    return next((r for r in _records() if r.folder == here), None)
+
+
+def is_first() -> bool:
+    """Whether no job of this machine is known, so that its kernels may have to be compiled."""
+    return not _records()
+
+
+def is_own_report(path: Path) -> bool:
+    """Whether a page is the report of a job that this machine wrote: the .blend names it, and may name anything."""
+    return path.name == "index.html" and path.parent.name == "report" and record_of(path.parents[1]) is not None
+
+
+def delete(record: Record) -> None:
+    """Delete a job's folder. Files that other jobs share stay theirs.
+
+    Raises
+    ------
+    BadInput
+        If a process is at work on it, or the folder is no longer what this machine wrote.
+    """
+    folder = Path(record.folder)
+    if is_held(folder / LOCK):
+        raise BadInput(f"{folder} is at work; cancel it first")
+    if not _is_unchanged(record):
+        raise BadInput(f"{folder} holds another job than was written there; look at it, and delete it yourself")
+    shutil.rmtree(folder)
+    _path_of(folder).unlink(missing_ok=True)
+
+
+def size(records: Iterable[Record]) -> int:
+    """Bytes on the disk; what jobs share counts once."""
+    found = {}
+    for record in records:
+        for folder, _, names in os.walk(record.folder):
+            for name in names:
+                with suppress(OSError):
+                    status = os.lstat(os.path.join(folder, name))
+                    found[status.st_dev, status.st_ino] = status.st_size
+    return sum(found.values())
+
+
+def _of_scene(scene: bpy.types.Scene, record: Record) -> bool:
+    alike = [s for s in bpy.data.scenes if s.gimp3d.id == record.scene]
+    return scene in alike and (len(alike) == 1 or scene.name == record.scene_name)
+
+
+def _is_unchanged(record: Record) -> bool:
     try:
-        return json.loads((folder / STATE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
+        return _digest(Path(record.folder)) == record.digest
+    except OSError:
+        return False
 
 
-def _write_state(folder: Path, state: dict[str, Any]) -> None:
-    write_atomically(folder / STATE, lambda f: f.write(json.dumps(state).encode()))
+def _digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "job.json").read_bytes()).hexdigest()
+
+
+def _path_of(folder: Path) -> Path:
+    return user_folder("record") / f"{hashlib.sha256(str(folder).encode()).hexdigest()[:32]}.json"
+
+
+def _write(record: Record) -> None:
+    write_atomically(_path_of(Path(record.folder)), lambda f: f.write(json.dumps(asdict(record)).encode()))
+    _last.clear()
+
+
+_last: dict[str, tuple[int, list[Record]]] = {}  # a panel asks many times a second
+
+
+def _records() -> list[Record]:
+    """All that this machine wrote."""
+    folder = user_folder("record")
+    changed = folder.stat().st_mtime_ns
+    if _last.get("", (0, []))[0] != changed:
+        _last[""] = changed, list(_read_all(folder))
+    return _last[""][1]
+
+
+def _read_all(folder: Path) -> Iterator[Record]:
+    for path in folder.glob("*.json"):
+        with suppress(OSError, ValueError, TypeError):  # a damaged one is none
+            yield Record(**json.loads(path.read_text(encoding="utf-8")))
 
 
 def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
@@ -106,8 +236,8 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
             reference = camera.id
     painted = settings.reference_paint
     picture = bpy.path.abspath(settings.reference_image) if settings.reference_image and painted is None else ""
-    if picture and not Path(picture).is_file():
-        raise BadInput(f"the reference picture {picture} does not exist")
+    if picture and not trust.is_known_photo(Path(picture)):
+        raise BadInput(f"the reference picture {picture} does not exist, or this file brought it along; load it again")
     if (picture or painted is not None) and not reference:
         raise BadInput("a reference picture needs its camera; choose the reference view")
     shaded = next((camera for camera, obj in views if obj == settings.shadow_camera), None)
@@ -120,10 +250,10 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         mask = backdrops.painted_over(settings.shadow_paint, SHADOW_BEFORE)
         backdrops.save_mask(mask, folder / "shadows" / f"{output_name(shaded.id)}.png")
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
-    write_transforms(folder / "transforms.json", [_with_photo(c, folder) for c, _ in views])
+    write_transforms(folder / "transforms.json", [_with_photo(c, folder / PHOTOS) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
     if picture:
-        shutil.copy2(picture, folder / f"reference{Path(picture).suffix}")
+        shutil.copyfile(picture, folder / f"reference{Path(picture).suffix}")
     if painted is not None:
         picture = str(folder / "reference.png")
         painted.save(filepath=picture, save_copy=True)
@@ -132,7 +262,7 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         cameras=str(folder / "transforms.json"),
         roi=str(folder / "roi.json"),
         out=str(folder / "out.ply"),
-        images=None if any(bridge.has_photo(obj) for _, obj in views) else "none",
+        images=str(folder / PHOTOS) if (folder / PHOTOS).is_dir() else "none",
         reference=reference or None,
         reference_image=str(folder / f"reference{Path(picture).suffix}") if picture else None,
         inpaint=settings.inpaint,
@@ -149,12 +279,27 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     return job
 
 
+def share_scene(folder: Path) -> None:
+    """Let the job's scene be the same file as that of a job beside it, where they are alike to the byte."""
+    scene, beside = folder / "scene.ply", (Path(r.folder) for r in _records())
+    others = (b / name for b in beside if b.parent == folder.resolve().parent for name in ("scene.ply", "out.ply"))
+    for other in others:
+        with suppress(OSError):  # gone, or on another disk, or one without links
+            if other.samefile(scene):
+                return
+            if other.stat().st_size == scene.stat().st_size and filecmp.cmp(other, scene, shallow=False):
+                link = folder / ".scene.link"
+                os.link(other, link)
+                os.replace(link, scene)  # both write anew, never in place
+                return
+
+
 def _with_photo(camera: Camera, folder: Path) -> Camera:
-    """The camera with its photo copied into the job, under an ID that names the file."""
-    if camera.image is None or not camera.image.is_file():
+    """The camera with its photo copied into a folder of the job's photos alone, under an ID that names the file."""
+    if camera.image is None:
         return camera
     name = camera.id if Path(camera.id).suffix else camera.id + camera.image.suffix
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copy2(camera.image, target)
+    shutil.copyfile(camera.image, target)
     return replace(camera, image=target)

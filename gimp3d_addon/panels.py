@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
+import time
 from pathlib import Path
 
 import bpy
@@ -13,8 +13,8 @@ from . import charts, jobs, splats, steps
 from .operators.base import RunsChild, current_splat
 from .operators.display import unfit_settings
 from .operators.remove import source_in
-from .operators.roi import FITS
-from .worker import duration
+from .operators.roi import FITS, proposed
+from .worker import COMPILING, duration
 
 LINE = 38  # characters that fit into the panel's default width
 
@@ -39,7 +39,8 @@ class StepPanel(InTab):
     step = staticmethod(steps.scene_step)
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        self.layout.label(text="", icon="ERROR" if self.step(context).missing else "CHECKMARK")
+        step = self.step(context)
+        self.layout.label(text="", icon="ERROR" if step.missing or step.warning else "CHECKMARK")
 
     def draw(self, context: bpy.types.Context) -> None:
         step = self.step(context)
@@ -48,8 +49,8 @@ class StepPanel(InTab):
             self.layout.label(text=" · ".join(step.facts))
         if step.hint:
             say(self.layout, step.hint, "INFO")
-        if step.missing:
-            say(self.layout, step.missing, "ERROR")
+        if step.missing or step.warning:
+            say(self.layout, step.missing or step.warning, "ERROR")
             for fix in step.fixes:
                 button(self.layout, fix)
         self.act(self.layout, context)
@@ -154,11 +155,13 @@ class GIMP3D_PT_views(StepPanel, bpy.types.Panel):
             layout.prop(settings, "view_collection", text="")
 
     def act(self, layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-        if self.step(context).missing:
+        step = self.step(context)
+        if step.missing:
             return
-        row = layout.row(align=True)
-        row.operator("gimp3d.add_views", text="Orbit")
-        row.operator("gimp3d.import_cameras", text="Import")
+        if not step.warning:  # else both are offered already
+            row = layout.row(align=True)
+            row.operator("gimp3d.add_views", text="Orbit")
+            row.operator("gimp3d.import_cameras", text="Import")
         row = layout.row(align=True)
         row.operator("gimp3d.look_through", text="Previous", icon="TRIA_LEFT").step = -1
         row.operator("gimp3d.look_through", text="Next", icon="TRIA_RIGHT").step = 1
@@ -193,19 +196,22 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
                 layout.progress(factor=settings.score, text=f"Score {settings.score:.2f}")
                 for words in settings.verdict.split("\n"):
                     say(layout, words, "INFO")
-        if settings.last_report:
+        if settings.last_report and jobs.is_own_report(Path(settings.last_report)):
             opened = layout.operator("wm.url_open", text="Open Report", icon="URL")
-            opened.url = Path(bpy.path.abspath(settings.last_report)).as_uri()
+            opened.url = Path(settings.last_report).as_uri()
 
     @staticmethod
     def _before(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         """What it will cost, and the button; or what to do first."""
         settings, told = context.scene.gimp3d, steps.forecast(context)
         panels = (GIMP3D_PT_scene, GIMP3D_PT_region, GIMP3D_PT_views)
-        missing = next(((p.bl_label, p.step(context)) for p in panels if p.step(context).missing), None)
+        found = [(p.bl_label, p.step(context)) for p in panels]
+        missing = next((f for f in found if f[1].missing), None)
         if missing is None and told is not None:
             cost = f"about {duration(told.seconds * settings.pace)}, {told.memory_mb / 1000:.1f} GB"
             layout.label(text=cost, icon="TIME")
+            if jobs.is_first():
+                layout.label(text=f"On a first run {duration(COMPILING)} more", icon="INFO")
             if settings.hole:
                 layout.label(text=f"Hole: {settings.hole}", icon="MOD_MASK")
         if missing is not None:
@@ -213,7 +219,11 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
             say(layout, f"Step {title[0]} first: {step.missing}", "ERROR")
             for fix in step.fixes[:1]:
                 button(layout, fix)
-        count = json.loads(settings.proposed or "{}").get("gaussians", 0)
+        for _, step in found if missing is None else ():
+            if step.warning:
+                say(layout, step.warning, "ERROR")
+                button(layout, step.fixes[0])
+        count = proposed(context)[0]
         if count:
             say(layout, f"The box cuts the object: {count:,} splats of it stay", "INFO")
             layout.operator("gimp3d.enlarge_roi", icon="FULLSCREEN_ENTER")
@@ -269,6 +279,34 @@ class GIMP3D_PT_fill(Advanced, bpy.types.Panel):
             self.layout.label(text="Google gets pictures, and bills each", icon="INFO")
 
 
+class GIMP3D_PT_jobs(Advanced, bpy.types.Panel):
+    """The folders of this file's removals"""
+
+    bl_idname = "GIMP3D_PT_jobs"
+    bl_label = "Job Folders"
+    bl_parent_id = "GIMP3D_PT_remove"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, found = self.layout, jobs.of_file(context)
+        lost = jobs.of_lost_files()
+        if lost:
+            layout.label(
+                text=f"{len(lost)} jobs of files that are gone · {jobs.size(lost) / 1e6:,.0f} MB", icon="GHOST_DISABLED"
+            )
+            layout.operator("gimp3d.delete_jobs", text="Delete Them").lost = True
+        if not found:
+            layout.label(text="None of this file", icon="INFO")
+            return
+        layout.label(text=f"{len(found)} jobs · {jobs.size(found) / 1e6:,.0f} MB", icon="DISK_DRIVE")
+        for record in reversed(found):
+            row = layout.row(align=True)
+            ago = duration(time.time() - record.started)
+            stopped = " · stopped" if record.open else ""
+            row.label(text=f"{Path(record.folder).name} · {jobs.size([record]) / 1e6:,.0f} MB · {ago} ago{stopped}")
+            row.operator("gimp3d.delete_jobs", text="", icon="TRASH").folder = record.folder
+        layout.operator("gimp3d.delete_jobs", text="Delete All but the Newest")
+
+
 class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):
     """The user's own named settings"""
 
@@ -287,4 +325,5 @@ CLASSES = (
     GIMP3D_PT_remove,
     GIMP3D_PT_reference,
     GIMP3D_PT_fill,
+    GIMP3D_PT_jobs,
 )

@@ -7,6 +7,7 @@ attributes `scale`, `rotation`, `opacity` and `splat_color` hold activated value
 from __future__ import annotations
 
 import json
+import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,12 +26,19 @@ from .native import attribute_values, is_native, read_native, write_native
 
 T = TypeVar("T")
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
+ID = "gimp3d_id"  # custom property of the object: the jobs that are about it know it by this
 COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
 GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
 DISPLAY = ("As Points", "Fraction")  # inputs of the node group
 EXTENT = 3.0  # standard deviations drawn
-MANY = 200_000  # from here on splats are shown as points unless the user asks otherwise
+RADIUS = "point_radius"  # attribute: of a splat shown as a point; 0 is not shown
+FAINT = 0.05  # opacity below which a splat is not shown as a point: points hide what lies behind them
+WIDE = 1.5  # standard deviations that a point covers
+LARGEST = 0.9  # quantile of the radii that no point exceeds: a few giants would hide the scene
+MANY = (
+    20_000  # from here on splats are shown as points unless the user asks otherwise: a scan's ellipsoids take minutes
+)
 UP_AXES = {
     "FILE": Matrix.Identity(4),
     "Y_DOWN": Matrix.Rotation(np.radians(-90), 4, "X"),  # COLMAP's usual scenes: (x, y, z) → (x, z, −y)
@@ -91,7 +99,7 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     )
     mesh.materials.append(splat_material())
     obj = bpy.data.objects.new(name, mesh)
-    obj.matrix_world = matrix
+    obj.matrix_world, obj[ID] = matrix, uuid.uuid4().hex
     modifier = obj.modifiers.new(GROUP, "NODES")
     modifier.node_group = node_group()
     set_display(obj, "As Points", len(gaussians) > MANY)
@@ -266,10 +274,24 @@ def _store_display(mesh: bpy.types.Mesh, gaussians: Gaussians, usable: np.ndarra
         ("rotation", "QUATERNION", "value", quats),
         ("opacity", "FLOAT", "value", gaussians.opacity),
         (COLOUR, "FLOAT_COLOR", "color", _shown_colours(0.5 + SH_C0 * gaussians.sh[:, 0])),
+        (RADIUS, "FLOAT", "value", point_radii(scales, gaussians.opacity, usable)),
     ):
         clean = np.array(array, np.float32)
         clean[hide] = 0
         _attribute(mesh, name, kind, key, clean)
+
+
+def point_radii(
+    scales: np.ndarray,  # [N, 3] standard deviations
+    opacity: np.ndarray,  # [N]
+    usable: np.ndarray,  # [N] bool
+) -> np.ndarray:
+    """How large each splat is as a point, [N] float32: by its middle axis, a disc's and not a needle's length."""
+    radii = WIDE * np.median(scales, axis=1)
+    shown = usable & (opacity >= FAINT)
+    if shown.any():
+        radii = np.minimum(radii, np.quantile(radii[shown], LARGEST))
+    return np.where(shown, radii, 0).astype(np.float32)
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str, key: str, array: np.ndarray) -> None:
@@ -315,13 +337,16 @@ def node_group() -> bpy.types.NodeTree:
     link(_named(tree, "scale", "FLOAT_VECTOR"), extent.inputs[0])
     link(extent.outputs[0], instances.inputs["Scale"])
 
-    dots = node("GeometryNodeMeshToPoints")
-    length = node("ShaderNodeVectorMath")
-    length.operation = "LENGTH"
-    link(_named(tree, "scale", "FLOAT_VECTOR"), length.inputs[0])
+    dots, radius = node("GeometryNodeMeshToPoints"), _named(tree, RADIUS, "FLOAT")
+    there, drawn = node("FunctionNodeCompare"), node("FunctionNodeBooleanMath")
+    there.data_type, there.operation, there.inputs["B"].default_value = "FLOAT", "GREATER_THAN", 0.0
+    drawn.operation = "AND"
+    link(radius, there.inputs["A"])
+    link(chosen.outputs["Result"], drawn.inputs[0])
+    link(there.outputs["Result"], drawn.inputs[1])
     link(source.outputs["Geometry"], dots.inputs["Mesh"])
-    link(chosen.outputs["Result"], dots.inputs["Selection"])
-    link(length.outputs["Value"], dots.inputs["Radius"])
+    link(drawn.outputs[0], dots.inputs["Selection"])
+    link(radius, dots.inputs["Radius"])
     coloured = node("GeometryNodeSetMaterial")
     coloured.inputs["Material"].default_value = point_material()
     link(dots.outputs["Points"], coloured.inputs["Geometry"])

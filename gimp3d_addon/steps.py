@@ -13,6 +13,7 @@ from gimp3d.errors import BadInput
 from gimp3d.forecast import Forecast, forecast_removal
 
 from . import bridge, splats
+from .bridge import present
 from .operators.base import current_boxes, current_splat
 
 FEW_VIEWS = 3  # below it hardly anything behind the object is seen
@@ -34,6 +35,7 @@ class Step:
     facts: tuple[str, ...] = ()
     missing: str = ""
     fixes: tuple[Fix, ...] = ()
+    warning: str = ""  # works, but the result will hardly be what is wanted; the fixes are for it too
     hint: str = ""  # works, but could be better
 
 
@@ -57,28 +59,43 @@ def region_step(context: bpy.types.Context) -> Step:
     if not boxes:
         return Step(missing="No box round the object yet", fixes=(here,) if splat else ())
     if splat is None:
-        return Step(facts=(f"{len(boxes)} boxes",))
+        return Step(missing="Import the scene first")
     try:
         inside = splats_inside(splat, boxes)
     except BadInput as error:
         return Step(missing=str(error))
     if inside == 0:
         return Step(missing="The box holds no splat; move it", fixes=(here,))
-    return Step(facts=(f"{inside:,} splats inside", f"{inside / splats.count(splat):.1%} of the scene"))
+    facts = (f"{inside:,} splats inside", f"{inside / splats.count(splat):.1%} of the scene")
+    if not any(present(context.scene, r.object) for r in context.scene.gimp3d.rois):
+        return Step(facts, warning=f"The active mesh, {boxes[0].name}, counts as the box", fixes=(here,))
+    return Step(facts)
 
 
 def views_step(context: bpy.types.Context) -> Step:
+    if current_splat(context) is None:
+        return Step(missing="Import the scene first")
     add = (Fix("gimp3d.add_views", "Orbit round the Box"), Fix("gimp3d.import_cameras", "Import Cameras"))
+    boxes = current_boxes(context)
     try:
-        found = bridge.view_sizes(context)
+        found = bridge.view_sizes(context, boxes)
     except BadInput as error:
         return Step(missing=str(error), fixes=add)
     if not found:
         return Step(missing="No view yet", fixes=add)
-    photos = sum(v.photo for v in found)
-    hint = f"Fewer than {FEW_VIEWS} views: little behind the object is seen" if len(found) < FEW_VIEWS else ""
-    with_photo = f"{photos} with photo" if photos else "drawn from the splats"
-    return Step(facts=(f"{len(found)} views", with_photo), hint=hint)
+    photos, strange = sum(v.photo for v in found), sum(v.strange_photo for v in found)
+    seeing = sum(v.sees for v in found)
+    counted = f"{len(found)} view{'s' if len(found) > 1 else ''}"
+    if seeing < len(found):
+        counted = f"{seeing} of {counted} see the box"
+    facts = (counted, f"{photos} with photo" if photos else "drawn from the splats")
+    hint = f"{strange} photos are not where you took photos from: import the cameras again" if strange else ""
+    if seeing == 0:
+        return Step(facts, missing="No view sees the box", fixes=add)
+    if seeing < FEW_VIEWS:
+        few = f"Only {seeing} view{'s' if seeing > 1 else ''}: much of what is behind the object will be invented"
+        return Step(facts, warning=few, fixes=add, hint=hint)
+    return Step(facts, hint=hint)
 
 
 def forecast(context: bpy.types.Context) -> Forecast | None:

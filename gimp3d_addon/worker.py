@@ -25,10 +25,16 @@ from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.forecast import Clock
 
 # The core's folder comes last on the path: a chosen Python uses its own NumPy, numba and OpenCV. The folder that
-# Blender was started in comes off it, as a user's numpy.py there must not be imported.
+# Blender was started in comes off it, as a user's numpy.py there must not be imported. A job is locked for as long as
+# the child lives, as it may outlive Blender.
 BOOT = """
-import importlib.util, sys
+import importlib.util, runpy, sys
 sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
+hold, lock = runpy.run_path(sys.argv.pop(1))["hold"], sys.argv.pop(1)
+held = hold(lock, patience=2.0) if lock else True
+if held is None:
+    print("gimp3d: error: another process is at work on this job; wait for it, or end it", file=sys.stderr)
+    sys.exit(2)
 missing = [m for m in ("numpy", "scipy", "numba", "cv2") if importlib.util.find_spec(m) is None]
 if missing:
     print(
@@ -42,10 +48,15 @@ entry_point()
 """
 
 
-def child_command(arguments: Sequence[str], python: str = "") -> list[str]:
-    """The command line that runs `gimp3d arguments` in a chosen Python, or in Blender's own."""
-    folder = Path(gimp3d.__file__).resolve().parents[1]
-    return [python or own_python(), "-X", "utf8", "-c", BOOT, str(folder), *arguments]
+def child_command(arguments: Sequence[str], python: str = "", lock: Path | None = None) -> list[str]:
+    """The command line that runs `gimp3d arguments` in a chosen Python, or in Blender's own, while it holds a lock."""
+    locking = (str(Path(__file__).with_name("lock.py")), str(lock or ""))
+    return [python or own_python(), "-X", "utf8", "-c", BOOT, core_folder(), *locking, *arguments]
+
+
+def core_folder() -> str:
+    """What goes onto a child's path, so that it finds the core."""
+    return str(Path(gimp3d.__file__).resolve().parents[1])
 
 
 def own_python() -> str:
@@ -58,6 +69,9 @@ def own_python() -> str:
     return found
 
 
+# s that the kernels take on a first run: the demo's takes 68 s of processor time, and 13 s from then on. That run's
+# speed says nothing of what is left
+COMPILING = 55.0
 GIVE_WAY = 10  # how much nicer than Blender a child is, so that drawing does not wait for a core
 
 
@@ -74,8 +88,9 @@ class Worker:
         python: str = "",
         clock: Clock | None = None,  # of a removal: turns stages into one bar and the time left
         command: Sequence[str] | None = None,  # instead of gimp3d
+        lock: Path | None = None,  # held while the child lives
     ) -> None:
-        command = command or child_command(arguments, python)
+        command = command or child_command(arguments, python, lock)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115, lives as long as the child
         try:
             self._process = subprocess.Popen(
@@ -159,6 +174,11 @@ class Worker:
         """What to show: the stage and, of a removal, the time left."""
         if self._clock is None or self.summary is not None:
             return self.status
+        if self.compiled:
+            left = (1 - self._clock.fraction) * (self._clock.forecast.seconds * pace + COMPILING)
+            return f"{self.status} · about {duration(left)} left (compiling: first run only)"
+        if self._clock.fraction == 0:  # whether it has to compile is said after reading
+            return self.status
         left = self._clock.seconds_left(time.monotonic() - self._started, pace)
         return f"{self.status} · about {duration(left)} left"
 
@@ -191,4 +211,6 @@ def duration(seconds: float) -> str:
     """A time in words of the right size."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"
-    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    if seconds < 5400:
+        return f"{round(seconds / 60)} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 2 * 86400 else f"{seconds / 86400:.0f} days"

@@ -1,8 +1,9 @@
 """Build the Blender extension: dist/gimp3d-<version>-<platform>.zip with the core and its compiled wheels inside.
 
-Stages the manifest, the add-on and the wheels, and lets Blender's own builder make and validate the zips: one for each
-platform, with wheels for both Pythons that Blender carries; Blender installs those that fit. NumPy is never bundled, as
-Blender brings its own.
+Stages the manifest, the add-on and the wheels, and lets Blender's own builder make and validate the zips: two for each
+platform. The full one has wheels for both Pythons that Blender carries; Blender installs those that fit. The light one
+has none, for a Blender with another Python, whose user presses Make Environment or chooses a Python. NumPy is never
+bundled, as Blender brings its own. pip compares every bundled file with its SHA-256 in gimp3d_addon/wheels.txt.
 
     python scripts/build_extension.py [--platform linux-x64] … [--without-compiled-wheels]
 """
@@ -17,10 +18,12 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DIST = ROOT / "dist"
+LOCK = ROOT / "gimp3d_addon" / "wheels.txt"  # written by lock_wheels.py
 BUNDLED = ("numba", "llvmlite", "scipy", "opencv-contrib-python-headless")
 PYTHONS = ("3.11", "3.13")  # Blender 4.2 to 5.0, and from 5.1 on
 PLATFORMS = {  # Blender's name → the tags that wheels for it may have
@@ -40,7 +43,7 @@ __all__ = ["register", "unregister"]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--platform", action="append", choices=(*PLATFORMS, "here"), help="default: all of them")
-    parser.add_argument("--without-compiled-wheels", action="store_true", help="small zip; needs a chosen Python")
+    parser.add_argument("--without-compiled-wheels", action="store_true", help="the light zips only")
     given = parser.parse_args()
     here = HERE.get((platform.system(), platform.machine()), "")
     chosen = [here if p == "here" else p for p in given.platform or PLATFORMS]
@@ -48,7 +51,9 @@ def main() -> None:
         sys.exit(f"build_extension: Blender has no extension platform for {platform.system()} {platform.machine()}")
     DIST.mkdir(exist_ok=True)
     for tag in chosen:
-        build(tag, compiled=not given.without_compiled_wheels)
+        build(tag, compiled=False)
+        if not given.without_compiled_wheels:
+            build(tag, compiled=True)
 
 
 def build(tag: str, compiled: bool) -> None:
@@ -77,11 +82,20 @@ def collect_wheels(folder: Path, tag: str) -> list[Path]:
         shutil.copy2(ROOT / name, source)
     pip("wheel", "--no-deps", "--wheel-dir", str(folder), str(source))
     shutil.rmtree(source)
+    bundled = folder.parent / "bundled.txt"
+    bundled.write_text(locked(BUNDLED))
     for python in PYTHONS if tag else ():
         tags = [option for name in PLATFORMS[tag] for option in ("--platform", name)]
-        pinned = ["--constraint", str(ROOT / "constraints.txt"), "--python-version", python, *tags]
-        pip("download", "--only-binary=:all:", "--no-deps", *pinned, "--dest", str(folder), *BUNDLED)
+        pinned = ["--require-hashes", "--requirement", str(bundled), "--python-version", python, *tags]
+        pip("download", "--only-binary=:all:", "--no-deps", *pinned, "--dest", str(folder))
+    bundled.unlink()
     return sorted(folder.glob("*.whl"))
+
+
+def locked(names: Sequence[str]) -> str:
+    """The part of wheels.txt that is about some libraries, with the hashes of their files."""
+    entries = LOCK.read_text(encoding="utf-8").replace("\\\n", "").splitlines()
+    return "".join(f"{entry}\n" for entry in entries if entry.partition("==")[0] in names)
 
 
 def write_manifest(path: Path, wheels: list[Path], tag: str) -> str:

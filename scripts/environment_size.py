@@ -7,33 +7,24 @@ Does what the button does, for this Python and platform, in a folder that goes w
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-SOURCE = Path(__file__).resolve().parents[1] / "gimp3d_addon" / "operators" / "environment.py"
+from build_extension import LOCK
 
 
 def main() -> None:
-    wanted = libraries(SOURCE)
     with tempfile.TemporaryDirectory(prefix="gimp3d-environment-") as folder:
         wheels, environment = Path(folder, "wheels"), Path(folder, "environment")
         subprocess.run([sys.executable, "-m", "venv", str(environment)], check=True)
         python = next(p for p in environment.glob("*/python*") if p.is_file())
         pip = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, "download", "--dest", str(wheels), *wanted], check=True)
+        pinned = ["--require-hashes", "--no-deps", "--only-binary=:all:", "--requirement", str(LOCK)]
+        subprocess.run([*pip, "download", "--dest", str(wheels), *pinned], check=True)
         subprocess.run([*pip, "install", "--no-index", "--no-deps", *map(str, wheels.iterdir())], check=True)
         print(f"{size(wheels) / 1e6:.0f} MB downloaded, {size(environment) / 1e6:.0f} MB on the disk")
-
-
-def libraries(path: Path) -> tuple[str, ...]:
-    """The constant LIBRARIES of a module that cannot be imported without Blender."""
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "LIBRARIES":
-            return ast.literal_eval(node.value)
-    raise SystemExit(f"environment_size: {path} has no LIBRARIES")
 
 
 def size(folder: Path) -> int:

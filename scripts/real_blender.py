@@ -17,11 +17,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from build_extension import LOCK
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOL = Path(os.environ.get("REAL_BLENDER", ROOT.parent / "shared" / "tools" / "real-blender"))
 SIZE = (1500, 1060)  # of the virtual screen
-LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 SUITES = {"trixie": ":77", "sid": ":78"}  # Blender 4.3 and 5.2 LTS, and the virtual screen of each
 PYTHON = "/root/gimp/bin/python"  # inside: runs removals, as no wheel of the extension fits Debian's own
 
@@ -39,7 +39,9 @@ class RealBlender:
             run(TOOL, "setup", suite, self.root)
         if not (self.root / PYTHON[1:]).exists():
             self.run("python3", "-m", "venv", str(Path(PYTHON).parents[1]))
-            self.run(PYTHON, "-m", "pip", "install", "-q", *LIBRARIES)
+            shutil.copy2(LOCK, self.root / "root")
+            pinned = ("--require-hashes", "--no-deps", "--only-binary=:all:", "-r", f"/root/{LOCK.name}")
+            self.run(PYTHON, "-m", "pip", "install", "-q", *pinned)
 
     def inside(self, *command: str) -> list[str]:
         """The command line that runs a command inside, on the virtual screen."""

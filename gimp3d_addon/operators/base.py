@@ -5,19 +5,23 @@ A failure is one line to the user, CANCELLED to the caller (a RuntimeError in sc
 
 from __future__ import annotations
 
+import textwrap
+from pathlib import Path
 from typing import Any
 
 import bpy
+from bpy.props import BoolProperty, IntProperty
 
 from gimp3d.errors import BadInput, Gimp3dError
 
-from .. import splats
+from .. import splats, trust
 from ..bridge import present
 from ..properties import preferences
 from ..worker import Worker
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
 AGAIN = {"PASS_THROUGH"}  # another child follows
+LONGEST = 1500  # characters of what a dialogue can show in full
 TICK = 0.1  # s between two looks at the child's progress
 
 
@@ -99,10 +103,7 @@ class RunsChild:
         if said != self._shown:  # drawing takes time too
             self._shown = said
             context.workspace.status_text_set(f"3D-GIMP: {said} (Esc cancels)")
-            for area in context.window.screen.areas:
-                for region in area.regions:
-                    if region.type == "UI":  # the panel, not the view
-                        region.tag_redraw()
+            redraw_panels(context)
         if not (ended or self.worker.cancelled):
             return {"PASS_THROUGH"}
         self._stop(context)
@@ -112,7 +113,9 @@ class RunsChild:
         return answer
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Blender ends the operator: another file is opened, or the window closes."""
+        """Blender ends the operator: another file is opened, the window closes, or its dialogue was cancelled."""
+        if RunsChild.running is not self:
+            return
         self.worker.cancel()
         self._stop(context)
         self.tidy()
@@ -129,6 +132,7 @@ class RunsChild:
         RunsChild.running = None
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
+        redraw_panels(context)
 
     def _end(self, context: bpy.types.Context) -> set[str]:
         if self.worker.cancelled:
@@ -151,6 +155,69 @@ class RunsChild:
         return {"CANCELLED"}
 
 
+class AsksFirst(RunsChild):
+    """Mixin: what the scene's providers would run is shown in full, and confirmed once on each machine.
+
+    Without a window nobody can be asked, so a script has to say that it is allowed.
+    """
+
+    allow_command: BoolProperty(
+        name="Allow Commands",
+        description="Run the command or model that the scene's settings name, unasked: for scripts that know the file",
+        options={"HIDDEN", "SKIP_SAVE"},
+    )
+    _shown: tuple[str, ...] = ()
+
+    def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
+        """What the user, or the .blend, chose."""
+        settings = context.scene.gimp3d
+        return settings.inpaint, settings.depth_prior
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        try:
+            self._shown = tuple(trust.unconfirmed(self.providers(context)))
+            if sum(map(len, self._shown)) > LONGEST:
+                raise BadInput("the settings Fill and Surface are too long to be shown, so they cannot be allowed")
+        except FAILURES as error:
+            self._shown = ()
+            return self._failed(error)
+        if not self._shown or bpy.app.background:
+            return self.execute(context)
+        return context.window_manager.invoke_props_dialog(
+            self,
+            width=560,
+            title="This file asks to run something on your machine",
+            confirm_text="Allow and Run",
+            cancel_default=True,
+        )
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """All of it: what is cut off could be the part that does harm."""
+        column = self.layout.column(align=True)
+        for said in self._shown:
+            for line in said.splitlines():
+                plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in line)  # nothing turns it round
+                for part in textwrap.wrap(plain, 80, drop_whitespace=False):
+                    column.label(text=part)
+            column.separator()
+        column.label(text="Allow it only if you know it. The preferences list what you allowed.", icon="ERROR")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if self._shown and not bpy.app.background:
+            trust.allow(self._shown)
+        try:
+            strange = trust.unconfirmed(self.providers(context))
+            if strange and not self.allow_command:
+                what = "; ".join(strange).replace("\n", ", ")
+                raise BadInput(
+                    f"nobody has allowed this on this machine: {what}; "
+                    "Remove Object asks, a script gives allow_command=True"
+                )
+        except FAILURES as error:
+            return self._failed(error)
+        return super().execute(context)
+
+
 class GIMP3D_OT_cancel(bpy.types.Operator):
     """Stop what is running now; the scene stays as it was"""
 
@@ -165,6 +232,15 @@ class GIMP3D_OT_cancel(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         RunsChild.running.worker.cancel()
         return {"FINISHED"}
+
+
+def redraw_panels(context: bpy.types.Context) -> None:
+    """The panel, not the view: drawing takes time."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions:
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def current_splat(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -199,11 +275,35 @@ def select_only(context: bpy.types.Context, obj: bpy.types.Object) -> None:
 
 
 def python_of(context: bpy.types.Context) -> str:
+    """The chosen Python's path; empty: Blender's own.
+
+    Raises
+    ------
+    BadInput
+        If it depends on where the .blend lies, or Blender was started: another Python could lie there.
+    """
     chosen = preferences(context)
-    return bpy.path.abspath(chosen.python) if chosen and chosen.python else ""
+    python = chosen.python if chosen else ""
+    if python.startswith("//") or (python and not Path(python).is_absolute()):
+        raise BadInput(f"the Python {python!r} in the preferences of 3D-GIMP must be a full path; choose it again")
+    return python
 
 
-CLASSES = (GIMP3D_OT_cancel,)
+class GIMP3D_OT_forget_allowed(bpy.types.Operator):
+    """Ask again before this is run"""
+
+    bl_idname = "gimp3d.forget_allowed"
+    bl_label = "Ask Again"
+
+    index: IntProperty(name="Index", min=0)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        for said in trust.allowed()[self.index : self.index + 1]:
+            trust.forget(said)
+        return {"FINISHED"}
+
+
+CLASSES = (GIMP3D_OT_cancel, GIMP3D_OT_forget_allowed)
 
 
 def light_words(shadow: dict[str, Any], reflection: dict[str, Any]) -> str:

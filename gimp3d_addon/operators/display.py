@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 from gimp3d.errors import BadInput
 
@@ -12,7 +13,29 @@ from ..native import is_native
 from .base import ReportsErrors, current_splat
 
 BOUNCES = 256  # transparent surfaces that a ray passes; with Blender's 8 crowded splats turn dark
+MOST = 10  # percent of the splats, at either end of each axis, that need not be in view after an import
 TRANSFORM = "Standard"  # splat colours are pictures' colours; AgX and Filmic would change them
+
+
+def show_imported(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    """Show a new scene in the 3D view that it was imported from, else in the first one."""
+    views = [area.spaces.active for area in context.screen.areas if area.type == "VIEW_3D"]
+    if context.space_data in views or views:
+        show_in(context.space_data if context.space_data in views else views[0], obj)
+
+
+def show_in(view: bpy.types.SpaceView3D, obj: bpy.types.Object) -> None:
+    """Let a 3D view show a scene's colours, and all of it but what lies far off: scans have strays everywhere."""
+    if view.shading.type in ("SOLID", "WIREFRAME"):
+        view.shading.type = "MATERIAL"
+    points = splats.positions(obj)
+    if len(points) == 0:
+        return
+    low, high = np.percentile(points, [MOST, 100 - MOST], axis=0)
+    middle, size = obj.matrix_world @ Vector((low + high) / 2), float(np.linalg.norm(high - low))
+    size *= obj.matrix_world.median_scale
+    view.region_3d.view_location, view.region_3d.view_distance = middle, max(size, 1e-6)
+    view.clip_start, view.clip_end = min(view.clip_start, 1e-3 * size), max(view.clip_end, 100 * size)
 
 
 class GIMP3D_OT_update_colours(ReportsErrors, bpy.types.Operator):

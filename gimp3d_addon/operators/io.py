@@ -13,8 +13,9 @@ from gimp3d.errors import BadInput
 from gimp3d.io.formats import read_scene
 from gimp3d.io.ply import write_ply
 
-from .. import splats
+from .. import jobs, splats
 from .base import ReportsErrors, current_splat, link, select_only
+from .display import show_imported
 
 UP_ITEMS = (
     ("FILE", "As in the file", "Keep the file's axes"),
@@ -47,8 +48,12 @@ class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
             self.report({"WARNING"}, "elements other than vertex are not kept")
         obj = splats.create_object(splats.default_name(path), file, splats.UP_AXES[self.up])
         link(context, obj)
+        jobs.identify(context.scene, obj)
         select_only(context, obj)
+        obj.select_set(False)  # still the active one; the outline of so many points would hide them
         context.scene.gimp3d.splat = obj
+        if not bpy.app.background:
+            show_imported(context, obj)
         self.report({"INFO"}, f"{len(file.gaussians):,} Gaussians, SH degree {file.gaussians.sh_degree}")
 
 

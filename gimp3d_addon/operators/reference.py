@@ -20,7 +20,7 @@ from gimp3d.job import RemovalJob
 
 from .. import backdrops, bridge, charts, jobs, splats
 from ..worker import Worker
-from .base import FAILURES, ReportsErrors, RunsChild, current_boxes, current_splat, light_words, python_of
+from .base import FAILURES, AsksFirst, ReportsErrors, RunsChild, current_boxes, current_splat, light_words, python_of
 
 PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior", "shadow": "shadow"}
 VIEW = "view"  # ID of the one camera that is drawn
@@ -55,6 +55,13 @@ class RunsInPassing(RunsChild):
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None
+
+
+class Looks(AsksFirst, RunsInPassing):
+    """Mixin: shows what would be filled, for which the surface is completed."""
+
+    def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
+        return (context.scene.gimp3d.depth_prior,)
 
 
 def _draw(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) -> Worker:
@@ -121,7 +128,7 @@ def _show(context: bpy.types.Context, camera: str, image: bpy.types.Image) -> No
     backdrops.show_in_image_editor(context, image)
 
 
-class GIMP3D_OT_preview_masks(RunsInPassing, bpy.types.Operator):
+class GIMP3D_OT_preview_masks(Looks, bpy.types.Operator):
     """Show over the reference (else active) camera's view what will be filled; also as images '3D-GIMP …'"""
 
     bl_idname = "gimp3d.preview_masks"
@@ -192,7 +199,7 @@ class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
         context.scene.gimp3d.reference = found
 
 
-class RunsReference(RunsInPassing):
+class RunsReference(Looks):
     """Mixin: a child for the mask, then one for the picture of the reference view; `deliver` takes both files.
 
     A chart's are there already, and no child is needed.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import bpy
+from bpy.props import BoolProperty, IntProperty, StringProperty
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput, Gimp3dError
@@ -14,13 +16,25 @@ from gimp3d.io.ply import read_ply
 
 from .. import charts, jobs, splats, steps
 from ..bridge import present
+from ..lock import is_held
 from ..worker import Killed, Worker, duration
-from .base import RunsChild, current_boxes, current_splat, light_words, link, python_of
+from .base import (
+    FAILURES,
+    AsksFirst,
+    ReportsErrors,
+    RunsChild,
+    current_boxes,
+    current_splat,
+    light_words,
+    link,
+    python_of,
+    redraw_panels,
+)
 
 SOURCE = "gimp3d_source"  # custom property of a result: the hidden object it came from
 
 
-class RunsRemoval(RunsChild):
+class RunsRemoval(AsksFirst):
     """Mixin: a removal in its job folder, and its result brought into the scene."""
 
     folder: Path
@@ -29,9 +43,12 @@ class RunsRemoval(RunsChild):
         context.scene.gimp3d.last_job = str(self.folder)
         forecast = steps.forecast(context)
         self._told = forecast.seconds if forecast and not more else 0.0
+        # the command line asks for it too: what is in the job was allowed by AsksFirst
+        allowed = ("--allow-command",) if any(p.startswith("command:") for p in self.providers(context)) else ()
         network = ["--allow-network"] * bpy.app.online_access
-        arguments = ["remove", "--job", str(self.folder), *more, *network, "--progress", "json"]
-        return Worker(arguments, python_of(context), Clock(forecast) if forecast else None)
+        arguments = ["remove", "--job", str(self.folder), *more, *allowed, *network, "--progress", "json"]
+        clock = Clock(forecast) if forecast else None
+        return Worker(arguments, python_of(context), clock, lock=self.folder / jobs.LOCK)
 
     def collect(self, context: bpy.types.Context) -> None:
         try:
@@ -39,7 +56,8 @@ class RunsRemoval(RunsChild):
         except Killed:
             raise  # the job stays open: Resume goes on with it
         except Gimp3dError:
-            jobs.close(self.folder)
+            if not is_held(self.folder / jobs.LOCK):  # else another Blender has taken it up, and goes on
+                jobs.close(self.folder)
             raise
         result = bring_back(context, self.folder)
         jobs.close(self.folder)
@@ -83,10 +101,27 @@ class GIMP3D_OT_remove_object(RunsRemoval, bpy.types.Operator):
         splat = current_splat(context)
         if splat is None:
             raise BadInput("no splat object; import a PLY first (3D-GIMP panel, step 1)")
+        python_of(context)  # before anything is written
         self.folder = jobs.new_job_folder(splat.name)
-        jobs.write_job(context, self.folder)
-        jobs.open_for(self.folder, splat)
+        try:
+            jobs.write_job(context, self.folder)
+        except BaseException:
+            shutil.rmtree(self.folder)
+            raise
+        jobs.share_scene(self.folder)
+        jobs.open_for(context, self.folder, splat)
         return self.run(context)
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """A box without splats is a slip, and waiting for a result that is the scene again helps nobody."""
+        try:
+            splat, boxes = current_splat(context), current_boxes(context)
+            if splat is not None and boxes and steps.splats_inside(splat, boxes) == 0:
+                self.report({"WARNING"}, "the box holds no splat: nothing to remove")
+                return {"CANCELLED"}
+        except FAILURES as error:
+            return self._failed(error)
+        return super().execute(context)
 
 
 class GIMP3D_OT_resume(RunsRemoval, bpy.types.Operator):
@@ -101,6 +136,12 @@ class GIMP3D_OT_resume(RunsRemoval, bpy.types.Operator):
         cls.poll_message_set("No removal was stopped half-way")
         return RunsChild.running is None and jobs.unfinished(context) is not None
 
+    def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
+        """The job's own, which may not be the scene's any more."""
+        folder = jobs.unfinished(context)
+        record = jobs.record_of(folder) if folder is not None else None
+        return tuple(record.providers) if record is not None else ()
+
     def start(self, context: bpy.types.Context) -> Worker:
         folder = jobs.unfinished(context)
         if folder is None:
@@ -114,12 +155,15 @@ def bring_back(context: bpy.types.Context, folder: Path) -> bpy.types.Object:
 
     Without the source (the file was never saved before a crash) the result comes alone.
     """
-    name, matrix = jobs.source_of(folder)
-    source = context.scene.objects.get(name)
+    record = jobs.record_of(folder)
+    if record is None:
+        raise BadInput(f"{folder} was not written on this machine")
+    source = jobs.source_in(context.scene, record)
     file = read_ply(folder / "out.ply")
+    name = source.name if source is not None else record.source_name
     title = name if source is not None and SOURCE in source else f"{name} removed"
     if source is None:
-        result = splats.create_object(title, file, Matrix(matrix))
+        result = splats.create_object(title, file, Matrix(record.matrix))
         link(context, result)
     else:
         result = splats.create_like(source, title, file)
@@ -139,7 +183,8 @@ def _hide(context: bpy.types.Context, obj: bpy.types.Object, hidden: bool) -> No
 def source_in(context: bpy.types.Context) -> bpy.types.Object | None:
     """The object that the current splat object was made from."""
     splat = current_splat(context)
-    return present(context.scene, splat.get(SOURCE)) if splat is not None else None
+    source = splat.get(SOURCE) if splat is not None else None
+    return present(context.scene, source) if isinstance(source, bpy.types.Object) else None
 
 
 class OnResult:
@@ -185,4 +230,41 @@ class GIMP3D_OT_restore(OnResult, bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (GIMP3D_OT_remove_object, GIMP3D_OT_resume, GIMP3D_OT_compare, GIMP3D_OT_restore)
+class GIMP3D_OT_delete_jobs(ReportsErrors, bpy.types.Operator):
+    """Delete this file's job folders from the disk; results in the scene stay, but stopped runs cannot be resumed"""
+
+    bl_idname = "gimp3d.delete_jobs"
+    bl_label = "Delete Old Jobs"
+
+    folder: StringProperty(name="Folder", description="Of one job; empty: all", options={"SKIP_SAVE"})
+    lost: BoolProperty(
+        name="Of Lost Files", description="Those whose .blend is gone, instead of this file's", options={"SKIP_SAVE"}
+    )
+    keep: IntProperty(name="Keep", default=1, min=0, description="How many of the newest stay", options={"SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        return context.window_manager.invoke_confirm(self, event)
+
+    def work(self, context: bpy.types.Context) -> None:
+        known = jobs.of_lost_files() if self.lost else jobs.of_file(context)
+        if self.lost:
+            chosen = known
+        elif self.folder:
+            chosen = [r for r in known if r.folder == self.folder]
+        else:
+            chosen = known[: len(known) - self.keep]
+        before = jobs.size(known)
+        for record in chosen:
+            jobs.delete(record)
+        freed = (before - jobs.size(known)) / 1e6
+        self.report({"INFO"}, f"{len(chosen)} jobs deleted, {freed:,.0f} MB freed")
+        redraw_panels(context)
+
+
+CLASSES = (
+    GIMP3D_OT_remove_object,
+    GIMP3D_OT_resume,
+    GIMP3D_OT_compare,
+    GIMP3D_OT_restore,
+    GIMP3D_OT_delete_jobs,
+)

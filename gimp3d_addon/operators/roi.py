@@ -54,6 +54,7 @@ class GIMP3D_OT_add_roi(ReportsErrors, bpy.types.Operator):
         mesh.from_pydata(corners, [], faces)
         box = bpy.data.objects.new("Remove this", mesh)
         box.display_type, box.hide_render = "WIRE", True
+        box.show_in_front = True  # splats would hide it
         box.matrix_world = matrix
         link(context, box)
         context.scene.gimp3d.rois.add().object = box
@@ -178,10 +179,9 @@ class GIMP3D_OT_enlarge_roi(ReportsErrors, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         settings, splat, cubes = context.scene.gimp3d, current_splat(context), current_boxes(context)
-        proposed = json.loads(settings.proposed or "{}").get("box")
-        if not proposed or splat is None or not cubes:
+        box = proposed(context)[1]
+        if box is None or splat is None or not cubes:
             raise BadInput("no box is proposed; run Preview Mask or Remove Object first")
-        box = Box.make(**proposed)
         frame = bridge.splat_frame(splat)
         # the one that was enlarged lies within it
         cut = min(cubes, key=lambda c: np.linalg.norm(bridge.box_from_blender(c, frame).center - box.center))
@@ -192,6 +192,15 @@ class GIMP3D_OT_enlarge_roi(ReportsErrors, bpy.types.Operator):
         unit = Matrix.LocRotScale(Vector(low + size / 2), None, Vector(size))
         cut.matrix_world = Matrix(frame.tolist()) @ placed @ unit.inverted()
         settings.proposed = ""
+
+
+def proposed(context: bpy.types.Context) -> tuple[int, Box | None]:
+    """How many splats of the object the box cut off, and the box that would hold them; the file may hold anything."""
+    try:
+        found = json.loads(context.scene.gimp3d.proposed or "{}")
+        return int(found.get("gaussians", 0)), Box.make(**found["box"]) if found.get("box") else None
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, BadInput):
+        return 0, None
 
 
 CLASSES = (

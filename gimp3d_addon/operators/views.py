@@ -16,7 +16,7 @@ from gimp3d.errors import BadInput
 from gimp3d.io.cameras import read_cameras
 from gimp3d.orbit import measured_up, orbit_cameras
 
-from .. import backdrops, bridge, charts, splats
+from .. import backdrops, bridge, charts, splats, trust
 from .base import ReportsErrors, current_boxes, current_splat, link
 
 COLLECTION = "3D-GIMP views"
@@ -80,6 +80,7 @@ class GIMP3D_OT_import_cameras(ReportsErrors, bpy.types.Operator, ImportHelper):
         cameras = [c for c in read_cameras(path, images) if self.split in ("all", c.split)]
         if not cameras:
             raise BadInput(f"{path} holds no {self.split} frame")
+        trust.know_photos(c.image for c in cameras if c.image is not None and c.image.is_file())
         add_cameras(context, cameras, current_splat(context), self.backgrounds)
         self.report({"INFO"}, f"{len(cameras)} cameras")
 

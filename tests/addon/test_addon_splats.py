@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bmesh
 import bpy
@@ -16,6 +18,7 @@ from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.io.images import read_image
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d_addon import jobs, splats
+from gimp3d_addon.operators.display import show_in
 from gimp3d_addon.operators.remove import bring_back
 
 XYZ = ["x", "y", "z"]
@@ -246,7 +249,7 @@ def test_a_million_splats_come_and_go_in_two_seconds_each(few_gaussians: Gaussia
         bpy.ops.gimp3d.add_roi(size=0.2)
         bpy.ops.gimp3d.add_views(count=3, width=64, height=48)
         timed("hand over", jobs.write_job, bpy.context, job)
-        jobs.open_for(job, splat)
+        jobs.open_for(bpy.context, job, splat)
         shutil.copyfile(tmp_path / "big.ply", job / "out.ply")
         timed("take back", bring_back, bpy.context, job)
         assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "big.ply").read_bytes()
@@ -269,3 +272,49 @@ def test_a_file_that_is_no_scene_is_refused_in_one_line(content: bytes | None, s
         bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "in.ply"))
     assert "gimp3d: error: " in str(caught.value) and "Traceback" not in str(caught.value)
     assert not bpy.data.meshes and bpy.context.scene.gimp3d.splat is None
+
+
+def test_points_are_capped_and_faint_splats_are_not_shown_as_points() -> None:
+    """A scan has a few giants, and haze that hides everything where it is drawn opaque."""
+    rng = np.random.default_rng(1)
+    scales = rng.uniform(0.5, 1, (1000, 3)) * 0.01
+    scales[:20] = 5.0  # giants
+    scales[20:40, 0] = 5.0  # needles
+    opacity = np.full(1000, 0.9)
+    opacity[500:700] = 0.01
+    usable = np.arange(1000) != 999
+    radii = splats.point_radii(scales, opacity, usable)
+    assert (radii[500:700] == 0).all() and radii[999] == 0 and radii.max() < 0.02
+    assert (radii[:500] > 0).all() and radii.dtype == np.float32
+    assert len(splats.point_radii(scales[:0], opacity[:0], usable[:0])) == 0
+
+
+def test_a_large_scene_is_shown_as_points_of_its_radii(few_gaussians: Gaussians, tmp_path: Path) -> None:
+    logits = few_gaussians.opacity_logits.copy()
+    logits[:7] = -9  # haze
+    rows = np.arange(splats.MANY + 1) % 50
+    write_gaussians(tmp_path / "big.ply", replace(few_gaussians, opacity_logits=logits).take(rows))
+    bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "big.ply"))
+    splat = bpy.context.object
+    assert not splat.select_get()  # an outline round so many points would hide them
+    evaluated = splat.evaluated_get(bpy.context.evaluated_depsgraph_get()).evaluated_geometry()
+    radii = np.empty(len(splat.data.vertices), np.float32)
+    splat.data.attributes[splats.RADIUS].data.foreach_get("value", radii)
+    cloud = evaluated.pointcloud
+    drawn = np.empty(len(cloud.points), np.float32)
+    cloud.attributes["radius"].data.foreach_get("value", drawn)
+    assert (np.sort(drawn) == np.sort(radii[radii > 0])).all() and 0 < len(drawn) < len(radii)
+
+
+def test_an_imported_scene_is_framed_with_its_colours(few_gaussians: Gaussians, import_scene) -> None:
+    """Without its strays, which a scan has everywhere."""
+    far = few_gaussians.means.copy()
+    far[0] = 1e4
+    splat = import_scene(replace(few_gaussians, means=far))
+    splat.location, splat.scale = (5, 0, 0), (2, 2, 2)
+    bpy.context.view_layer.update()
+    region = SimpleNamespace(view_location=None, view_distance=None)
+    view = SimpleNamespace(shading=SimpleNamespace(type="SOLID"), region_3d=region, clip_start=0.1, clip_end=100.0)
+    show_in(view, splat)
+    assert view.shading.type == "MATERIAL" and 2 < region.view_distance < 20
+    assert np.linalg.norm(np.array(region.view_location) - (5, 0, 0)) < 2 and view.clip_end > region.view_distance

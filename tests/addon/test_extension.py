@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import build_extension
 import numpy as np
 import pytest
 from scenes import REGION, scene
@@ -100,10 +102,42 @@ def test_the_light_zip_installs_enables_and_removes(tmp_path: Path) -> None:
     install_and_run(zip_path, tmp_path, Path(sys.executable), {})
 
 
+def test_the_zip_bundles_pinned_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    downloads: list[tuple[tuple[str, ...], str]] = []
+
+    def pip(*arguments: str) -> None:
+        if arguments[0] == "download":
+            wanted = Path(arguments[arguments.index("--requirement") + 1]).read_text()
+            downloads.append((arguments, wanted))
+
+    monkeypatch.setattr(build_extension, "pip", pip)
+    build_extension.collect_wheels(tmp_path / "wheels", "linux-x64")
+    assert len(downloads) == len(build_extension.PYTHONS)
+    for arguments, wanted in downloads:
+        assert {"--require-hashes", "--no-deps", "--only-binary=:all:"} <= set(arguments)
+        assert not set(arguments) & set(build_extension.BUNDLED)  # none beside those of the list
+        entries = wanted.splitlines()
+        assert {e.partition("==")[0] for e in entries} == set(build_extension.BUNDLED)
+        assert all("--hash=sha256:" in e for e in entries)
+
+
+def test_both_zips_are_built_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The light one for Blenders with a Python that no wheel fits: the full one cannot be installed there."""
+    built: list[tuple[str, bool]] = []
+    monkeypatch.setattr(build_extension, "build", lambda tag, compiled: built.append((tag, compiled)))
+    monkeypatch.setattr(sys, "argv", ["build_extension"])
+    build_extension.main()
+    assert set(built) == {(tag, compiled) for tag in build_extension.PLATFORMS for compiled in (False, True)}
+
+
 @pytest.mark.slow
 def test_the_full_zip_carries_all_that_the_core_needs(tmp_path: Path) -> None:
     """In an environment with only bpy and its own requirements, as a fresh Blender: the wheels come from the zip."""
     zip_path = build()
+    with zipfile.ZipFile(zip_path) as found:
+        wheels = [n for n in found.namelist() if n.endswith(".whl") and "gimp3d" not in n]
+        digests = [hashlib.sha256(found.read(n)).hexdigest() for n in wheels]
+    assert wheels and all(f"sha256:{d}" in build_extension.LOCK.read_text() for d in digests)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "env")], check=True)
     python = tmp_path / "env" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     site = Path(np.__file__).resolve().parents[1]

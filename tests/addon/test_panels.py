@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import inspect
+import json
+import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import bpy
+import numpy as np
 import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Quaternion
 from scenes import REGION, cameras, scene
 
+from gimp3d.forecast import Clock, forecast_removal
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
-from gimp3d_addon import panels, steps
+from gimp3d.io.ply import write_gaussians
+from gimp3d_addon import bridge, jobs, panels, steps
 from gimp3d_addon.operators.base import RunsChild
 from gimp3d_addon.worker import Worker, duration
+
+STEPS = (steps.scene_step, steps.region_step, steps.views_step)
 
 
 class RecordingLayout:
@@ -180,6 +190,110 @@ def test_every_property_and_operator_explains_itself(splat: bpy.types.Object) ->
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s"), (75, "75 s"), (200, "3 min"), (7200, "2.0 h")])
 def test_times_are_said_in_the_right_size(seconds: float, words: str) -> None:
     assert duration(seconds) == words
+
+
+def test_what_a_new_file_holds_ticks_no_step(tmp_path: Path) -> None:
+    """Blender starts with a camera and a cube."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    assert [bool(step(bpy.context).missing) for step in STEPS] == [True] * 3
+    write_gaussians(tmp_path / "scene.ply", scene())
+    bpy.ops.gimp3d.import_ply(filepath=str(tmp_path / "scene.ply"))
+    assert steps.region_step(bpy.context).missing and steps.views_step(bpy.context).warning
+    bpy.context.view_layer.objects.active = bpy.data.objects["Cube"]
+    assert "The active mesh, Cube" in steps.region_step(bpy.context).warning
+    log = drawn()
+    assert "The active mesh, Cube, counts" in " ".join(log) and "Only 1 view: much" in " ".join(log)
+    below = log[log.index("grow") - 12 : log.index("grow")]  # beside the button, with the way out
+    assert "gimp3d.add_views" in below and "gimp3d.add_roi" in below
+
+
+def test_views_that_look_away_from_the_box_do_not_count(splat: bpy.types.Object, tmp_path: Path) -> None:
+    add_box()
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    views = list(bpy.context.scene.gimp3d.view_collection.objects)
+    for k, obj in enumerate(views):
+        obj.rotation_mode = "QUATERNION"
+        if k >= 2:
+            obj.rotation_quaternion = obj.rotation_quaternion @ Quaternion((0, 1, 0), np.pi)
+    bpy.context.view_layer.update()
+    step = steps.views_step(bpy.context)
+    assert step.facts[0] == "2 of 9 views see the box" and step.warning.startswith("Only 2 views")
+    assert step.fixes[0].operator == "gimp3d.add_views"
+    for obj in views[:2]:
+        obj.location = (0, 0, 50)
+        obj.rotation_quaternion = (0, 1, 0, 0)  # up
+    bpy.context.view_layer.update()
+    assert steps.views_step(bpy.context).missing == "No view sees the box"
+    bpy.ops.gimp3d.add_views(count=6)
+    assert steps.views_step(bpy.context) == steps.Step(("6 views", "drawn from the splats"))
+
+
+def test_the_users_own_camera_sees_what_its_picture_shows(splat: bpy.types.Object) -> None:
+    """Against Blender's own mapping, for boxes all round it."""
+    camera = bpy.data.objects.new("own", bpy.data.cameras.new("own"))
+    bpy.context.scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (0.3, -2, 0.7), (1.2, 0.1, 0.2)
+    camera.data.shift_x = 0.2
+    box = add_box()
+    box.scale = (1e-3,) * 3
+    told = []
+    for place in np.random.default_rng(0).uniform(-3, 3, (60, 3)):
+        box.location = place
+        bpy.context.view_layer.update()
+        u, v, depth = world_to_camera_view(bpy.context.scene, camera, box.matrix_world.translation)
+        expected = depth > 0 and 0 < u < 1 and 0 < v < 1
+        told.append((bridge.view_sizes(bpy.context, [box])[0].sees, expected))
+    assert all(a == b for a, b in told) and {b for _, b in told} == {True, False}
+
+
+def test_a_first_run_counts_down_and_says_why_it_takes_long() -> None:
+    """The kernels are compiled in whatever stage needs them, so this run's own speed says nothing."""
+    clock = Clock(forecast_removal(10_000, 9, 9 * 120 * 90))
+    worker = Worker(["--version"], clock=clock)
+    worker.join()
+    worker._take(json.dumps({"stage": "compile", "done": 0, "total": 1}))
+    lefts = []
+    for passed, stage in enumerate(["read", "masks", "surfaces", "light", "charts", "propagate", "seed", "verdict"]):
+        worker._started = time.monotonic() - 15 * passed
+        worker._take(json.dumps({"stage": stage, "done": 1, "total": 1}))
+        lefts.append(seconds_in(worker.words()))
+    assert lefts == sorted(lefts, reverse=True) and lefts[0] > 30 and "first run only" in worker.words()
+
+
+def seconds_in(words: str) -> float:
+    number, unit = re.search(r"about (\d+) (s|min) left", words).groups()
+    return float(number) * (60 if unit == "min" else 1)
+
+
+def test_the_panel_lists_this_files_jobs_with_their_sizes(splat: bpy.types.Object, tmp_path: Path) -> None:
+    assert "None of this file" in drawn()
+    add_box()
+    bpy.ops.gimp3d.import_cameras(filepath=str(tmp_path / "transforms.json"))
+    folder = jobs.new_job_folder("scene")
+    jobs.write_job(bpy.context, folder)
+    jobs.open_for(bpy.context, folder, splat)
+    log = drawn()
+    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) / 1e6
+    assert f"1 jobs · {size:,.0f} MB" in log and "gimp3d.delete_jobs" in log
+    assert any(line.startswith("scene-001 · ") and line.endswith("stopped") for line in log)
+
+
+def test_what_the_file_proposes_may_be_anything(splat: bpy.types.Object) -> None:
+    add_box()
+    for proposed in (
+        "[]",
+        "5",
+        "{",
+        '{"gaussians": "many"}',
+        '{"box": 5}',
+        '{"box": {"center": 1}}',
+        "null",
+        '{"box": []}',
+    ):
+        bpy.context.scene.gimp3d.proposed = proposed
+        assert drawn()
+        with pytest.raises(RuntimeError, match="no box is proposed"):
+            bpy.ops.gimp3d.enlarge_roi()
 
 
 def test_charts_are_offered_to_look_at(splat: bpy.types.Object, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,7 +95,7 @@ def test_blender_and_the_shell_give_the_same_bytes(folder: Path, up: str | None)
     assert json.loads((job / "roi.json").read_text()) == [told]
     assert (folder / "blender.ply").read_bytes() == shell(folder, "shell.ply")
     (job / "out.ply").unlink()
-    shutil.rmtree(job / "stages")
+    assert not (job / "stages").exists()  # nothing to go on from, and most of the folder's size
     assert main(["remove", "--job", str(job), "--progress", "none"]) == 0
     assert (job / "out.ply").read_bytes() == (folder / "shell.ply").read_bytes()
 
@@ -155,16 +154,12 @@ def test_pictures_of_a_view_the_mask_and_the_reference(folder: Path) -> None:
     [
         (lambda s: setattr(s, "scale", (1, 2, 1)), "scaled unevenly"),
         (lambda s: setattr(bpy.context.scene.gimp3d, "inpaint", "magic"), "unknown provider"),
-        (lambda s: setattr(bpy.context.scene.gimp3d.rois[0].object, "location", (0, 0, 99)), None),
         (lambda s: setattr(bpy.context.scene.gimp3d, "view_collection", None), "collection"),
     ],
 )
-def test_errors_are_the_command_lines_own_line_and_change_nothing(folder: Path, spoil, words: str | None) -> None:
+def test_errors_are_the_command_lines_own_line_and_change_nothing(folder: Path, spoil, words: str) -> None:
     splat = prepare(folder)
     spoil(splat)
-    if words is None:  # an empty region is no error: the result is the scene as it was
-        assert bpy.ops.gimp3d.remove_object() == {"FINISHED"}
-        return
     with pytest.raises(RuntimeError, match=f"gimp3d: error: .*{words}"):
         bpy.ops.gimp3d.remove_object()
     assert not splat.hide_get() and [o for o in bpy.data.objects if splats.is_splat(o)] == [splat]

@@ -33,6 +33,7 @@ class Window:
             event_timer_add=lambda *_, **__: "timer",
             event_timer_remove=lambda *_: None,
             modal_handler_add=lambda *_: True,
+            windows=[self.window],
         )
         self.workspace = SimpleNamespace(status_text_set=self.status.append)
 
@@ -207,7 +208,10 @@ def test_opening_another_file_ends_the_run(splat: bpy.types.Object) -> None:
     class Pressed(RunsRemoval):
         worker, _timer = running, "timer"
 
-    Pressed().cancel(Window())
+    RunsChild.running = Pressed()
+    Pressed().cancel(Window())  # one whose dialogue was cancelled: it runs nothing
+    assert running._process.poll() is None and RunsChild.running is not None
+    RunsChild.running.cancel(Window())
     assert running._process.poll() is not None and RunsChild.running is None
 
 
