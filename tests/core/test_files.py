@@ -57,7 +57,7 @@ def test_devices_and_pipes_are_written_to_and_never_replaced(tmp_path: Path) -> 
 @pytest.mark.parametrize("read", [read_scene, read_cameras, read_image, lambda p: load_job(p.parent)])
 def test_a_pipe_is_refused_as_input_instead_of_waited_for(read, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     os.mkfifo(tmp_path / "job.json")
-    with pytest.raises(BadInput, match="pipe|not a file"):
+    with pytest.raises(BadInput, match=r"pipe|not a file"):
         read(tmp_path / "job.json")
     with pytest.raises(BadInput):
         require_file(Path(os.devnull))
