@@ -26,6 +26,9 @@ from gimp3d.pipeline import RemovalResult
 
 posix = pytest.mark.skipif(os.name != "posix", reason="a matter of POSIX systems")
 
+MOMENTS = 12  # at which a run is stopped, from its start to its end
+KILLS = 6  # of a removal that is then gone on with
+
 # Stands for the work: nothing is removed, so a command takes as long as reading and writing do
 QUICK = (
     "import sys, os, time, signal\n"
@@ -175,7 +178,7 @@ def test_a_signal_at_any_moment_leaves_out_whole(name: str, folder: Path) -> Non
     begun = time.monotonic()
     start(folder, "--out", folder / "out.ply").communicate()
     lasts = time.monotonic() - begun
-    for delay in np.linspace(0, 1.1 * lasts, 12):
+    for delay in np.linspace(0, 1.1 * lasts, MOMENTS):
         (folder / "out.ply").write_bytes(b"precious")
         with start(folder, "--out", folder / "out.ply") as running:
             time.sleep(delay)
@@ -189,6 +192,29 @@ def test_a_signal_at_any_moment_leaves_out_whole(name: str, folder: Path) -> Non
     assert main(options(folder, "--out", folder / "out.ply", "--preset", "none")) == 2
     start(folder, "--out", folder / "out.ply").communicate()
     assert not [p for p in folder.iterdir() if p.name.endswith(UNFINISHED)]
+
+
+@pytest.mark.slow
+def test_a_killed_removal_goes_on_to_the_same_bytes(folder: Path) -> None:
+    def command(name: str, *more: str) -> list[str]:
+        job = ["--job", str(folder / name), "--out", str(folder / name / "out.ply"), "--preset", "draft"]
+        return [sys.executable, "-m", "gimp3d", *options(folder, *job), *more]
+
+    for name in ("cold", "whole"):  # the first may have to compile
+        begun = time.monotonic()
+        subprocess.run(command(name), check=True)
+        lasts = time.monotonic() - begun
+    expected = (folder / "whole" / "out.ply").read_bytes()
+    for k in range(KILLS):
+        name = f"killed{k}"
+        with subprocess.Popen(command(name)) as running:
+            time.sleep((k + 0.5) / KILLS * lasts)
+            running.kill()
+        out = folder / name / "out.ply"
+        assert not out.exists() or out.read_bytes() == expected
+        subprocess.run(command(name, "--resume"), check=True)
+        assert out.read_bytes() == expected
+        assert not list((folder / name).rglob(f".*{UNFINISHED}"))
 
 
 # -------------------------------------------------------------------------------------------------- nobody who listens

@@ -25,6 +25,7 @@ import pytest
 from plyfile import PlyData
 from scenes import REGION, block, cameras, discs, scene, truth
 
+from gimp3d import pipeline
 from gimp3d.box import Box, Region
 from gimp3d.camera import Camera, Distortion
 from gimp3d.cli import Reporter, main
@@ -747,7 +748,10 @@ def in_a_child(folder: Path, first: str, options: Sequence[object] = ()) -> subp
 
 
 @row(BREAKDOWN, "crash")
-def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove) -> None:
+def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove, monkeypatch: pytest.MonkeyPatch) -> None:
+    def again(*_: object) -> None:
+        raise AssertionError("a finished stage ran again")
+
     undisturbed = remove(change=old_result)
     folder = undisturbed.folder
     expected = (folder / "out.ply").read_bytes()
@@ -757,9 +761,9 @@ def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove) -> None:
     crash = "import os, gimp3d.pipeline as p; p.mapping_field = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
+    monkeypatch.setattr(pipeline, "find_masks", again)
     assert main([str(a) for a in command(folder, ("--job", job, "--resume"))]) == 0
     assert (folder / "out.ply").read_bytes() == expected
-    assert undisturbed.stage("masks")["seconds"] < 0.05  # taken from the job folder
 
 
 @row(BREAKDOWN, "out of memory")
