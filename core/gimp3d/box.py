@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from .errors import BadInput
 from .gaussians import matrices_to_quats, quats_to_matrices
-from .schema import read_json
+from .schema import checked, read_json
 
 LARGEST_ROI = 1 << 20  # bytes of a ROI's file
 MOST_BOXES = 50
@@ -131,4 +131,14 @@ def read_region(path: Path | str) -> Region:
     for box in boxes:
         if not isinstance(box, dict) or not {"center", "size"} <= set(box):
             raise BadInput(f'ROI: {path} must hold {{"center", "size", "rotation_wxyz"}} or a list of such boxes')
-    return tuple(Box.make(b["center"], b["size"], b.get("rotation_wxyz", (1, 0, 0, 0))) for b in boxes)
+    read = (checked(_Entry, box, f"ROI: {path}", extra=True) for box in boxes)
+    return tuple(Box.make(b.center, b.size, b.rotation_wxyz) for b in read)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A box of a ROI file."""
+
+    center: list[float]
+    size: list[float]
+    rotation_wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])

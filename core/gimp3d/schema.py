@@ -35,7 +35,7 @@ class Between:
         return f"from {self.low:g} to {self.high:g}"
 
 
-# Types of settings. A plain float is finite and not negative, a plain int from 0 to 1,000.
+# Types of settings. A plain number is from 0 to 1,000.
 Share = Annotated[float, Between(0, 1)]
 Positive = Annotated[float, Between(1e-9)]
 Signed = Annotated[float, Between()]
@@ -43,7 +43,7 @@ Degrees = Annotated[float, Between(0, 180)]
 AtLeastOne = Annotated[int, Between(1, 1_000)]
 Many = Annotated[int, Between(1, 10_000_000)]
 Seed = Annotated[int, Between(0, 2**32 - 1)]
-SETTING = {float: Between(0), int: Between(0, 1_000)}
+SETTING = {float: Between(0, 1_000), int: Between(0, 1_000)}
 ANY = {float: Between(), int: Between()}
 
 
@@ -105,6 +105,9 @@ def checked(
             return None
         (one,) = (a for a in arguments if a is not type(None))
         return checked(one, value, where, bounds, extra)
+    if origin is list:
+        items = _as(list, value, where, "a list")
+        return [checked(arguments[0], item, where, bounds, extra) for item in items]
     if origin is dict:
         pairs = _as(dict, value, where, "a mapping")
         of_key, of_value = arguments

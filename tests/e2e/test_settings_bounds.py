@@ -69,7 +69,21 @@ def test_a_setting_at_its_bound_is_done_or_refused(
     try:
         refine = () if key.startswith("refine.steps") else ("--set", f"refine.steps={2 if 'refine' in key else 0}")
         steps = "3" if key == "refine.steps" and int(value) > 3 else value  # as many as it takes, that is
-        code = main(["remove", *options, "--images", "none", "--progress", "none", *refine, "--set", f"{key}={steps}"])
+        code = main(
+            [
+                "remove",
+                *options,
+                "--images",
+                "none",
+                "--progress",
+                "none",
+                "--preset",
+                "draft",
+                *refine,
+                "--set",
+                f"{key}={steps}",
+            ]
+        )
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)

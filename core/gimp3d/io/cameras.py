@@ -246,7 +246,7 @@ class _Frame:
     """A frame of a transforms.json, with what the document says of all of them."""
 
     file_path: Any = None
-    transform_matrix: Any = None
+    transform_matrix: list[list[float]] | None = None
     world_to_camera: Any = None  # EXACT
     w: int | None = None
     h: int | None = None
@@ -352,8 +352,8 @@ class _Entry:
     """A camera of Inria's cameras.json."""
 
     img_name: Any
-    rotation: Any
-    position: Any
+    rotation: list[list[float]]
+    position: list[float]
     fx: float
     fy: float
     width: int

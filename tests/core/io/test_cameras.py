@@ -200,7 +200,7 @@ REFUSALS = {
     ),
     "a lens of a million pixels": ({"fl_x": 1e7, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "no lens"),
     "400 digits": ({"fl_x": 10**400, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "fl_x: a finite"),
-    "400 digits in a pose": ({"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": [[10**400]]}]}, "4×4"),
+    "400 digits in a pose": ({"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": [[10**400]]}]}, "finite"),
     "huge pose": (
         {"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": (1e200 * np.eye(4)).tolist()}]},
         "sense",
