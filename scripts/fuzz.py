@@ -63,7 +63,7 @@ def main() -> int:
             command = [sys.executable, __file__, "--out", str(given.out), "--only", name, "--chunk", str(size)]
             ran = subprocess.run(command, capture_output=True, text=True, errors="replace")
             if ran.returncode:
-                print(f"{name}: found something\n{ran.stderr[-3000:]}", flush=True)
+                print(f"{name}: found something\n{ran.stdout[-2000:]}{ran.stderr[-1000:]}", flush=True)
                 names.remove(name)
                 failed = True
                 continue

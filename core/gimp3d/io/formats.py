@@ -265,7 +265,7 @@ def _from_sog(read: Read, path: Path) -> Gaussians:
 
         def decoded(part: str, values: np.ndarray) -> np.ndarray:
             if "codebook" in meta[part]:
-                return np.array(meta[part]["codebook"], np.float64)[values]
+                return np.array(checked(list[float], meta[part]["codebook"], where))[values]
             low, high = np.array(meta[part]["mins"], np.float64), np.array(meta[part]["maxs"], np.float64)
             return low + values / 255 * (high - low)
 
@@ -354,14 +354,17 @@ def _gaussians(
 ) -> Gaussians:
     # 0 and 255 stand for what was rounded to them; their logits would be infinite.
     alpha = np.clip(opacity, 0.25 / 255, 1 - 0.25 / 255)
-    sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
-    if sh.shape[1] not in (1, 4, 9, 16):
-        raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
-    return Gaussians(
-        means=np.ascontiguousarray(means, np.float32),
-        log_scales=np.maximum(log_scales, np.log(1e-30)).astype(np.float32),  # some formats can say 0
-        quats=np.ascontiguousarray(quats, np.float32),
-        opacity_logits=np.log(alpha / (1 - alpha)).astype(np.float32),
-        sh=sh.astype(np.float32),
-        antialiased=antialiased,
-    )
+    try:
+        sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
+        if sh.shape[1] not in (1, 4, 9, 16):
+            raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
+        return Gaussians(
+            means=np.ascontiguousarray(means, np.float32),
+            log_scales=np.maximum(log_scales, np.log(1e-30)).astype(np.float32),  # some formats can say 0
+            quats=np.ascontiguousarray(quats, np.float32),
+            opacity_logits=np.log(alpha / (1 - alpha)).astype(np.float32),
+            sh=sh.astype(np.float32),
+            antialiased=antialiased,
+        )
+    except ValueError as error:
+        raise BadInput(f"{path}: its parts do not fit together ({error})") from None

@@ -383,6 +383,7 @@ SOG_DAMAGE = {
     "no files": {"means": {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": []}},
     "a file of another type": {"quats": {"files": [5]}},
     "numbers for files": {"quats": 5},
+    "a codebook of lists": {"count": 0, "sh0": {"codebook": [[]], "files": ["sh0.webp"]}},
     "nothing for limits": {"means": {"mins": None, "maxs": {}, "files": ["means_l.webp", "means_u.webp"]}},
 }
 
