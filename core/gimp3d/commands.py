@@ -76,6 +76,7 @@ def convert(source: Path, target: Path) -> None:
     """Write a scene of any kind that `read_scene` knows as a plain binary PLY in Inria's layout."""
     if target.suffix.lower() != ".ply":
         raise BadInput(f"convert: {target} must end in .ply")
+    try_target(target)
     write_gaussians(target, read_scene(source).gaussians)
 
 
@@ -122,6 +123,7 @@ def render_views(
         raise BadInput(f"render: --scale must be in (0, 16], got {scale}")
     if not all(0 <= b <= 1 for b in background):
         raise BadInput("render: --background takes three numbers from 0 to 1")
+    try_target(out, is_folder=True)
     file = read_scene(scene)
     chosen = select_cameras(read_cameras(cameras), split, frames)
     frame = frame_of(file, chosen)
@@ -168,6 +170,8 @@ def write_masks(
     removal would use, charts/, see `write_charts`.
     """
     _use_threads(threads)
+    for folder in (out, *([pictures] if pictures else [])):
+        try_target(folder, is_folder=True)
     file, region = read_scene(scene), read_region(roi)
     available = read_cameras(cameras, _images_folder(images))
     frame = frame_of(file, available)

@@ -426,6 +426,16 @@ BAD = {
     "setting of a wrong type": (
         [*f"{REMOVE} --set seed.opacity=much".split()], 2, "takes a float",
     ),
+    "negative margin": (f"{REMOVE} --set masks.margin=-1".split(), 2, "masks.margin: must be from 0 to 1000, got -1"),
+    "NaN for a setting": (f"{REMOVE} --set masks.selection.rim=nan".split(), 2, "a finite number"),
+    "a huge setting": (f"{REMOVE} --set masks.selection.rim=1e9".split(), 2, "from 0 to 1000"),
+    "no cells": (f"{REMOVE} --set masks.selection.surroundings.cells=0".split(), 2, "from 1 to"),
+    "an unknown word for a setting": (f"{REMOVE} --set masks.mode=some".split(), 2, "need or paper expected"),
+    "a file for a job": (["remove", "--job", "roi.json"], 2, "job.json"),
+    "a file for a new job": (f"{REMOVE} --job roi.json".split(), 2, "cannot make the folder"),
+    "one pixel for a photo": (
+        "remove scene.ply --cameras pixel.json --roi roi.json".split(), 2, "far fewer",
+    ),
     "a preset of a later version": (f"{REMOVE} --preset someday".split(), 2, "not in this version"),
     "negative seed": (f"{REMOVE} --seed -1".split(), 2, "--seed"),
     "no CUDA": ([*f"{REMOVE} --device cuda".split()], 2, "CUDA"),
@@ -462,6 +472,10 @@ def bad_folder(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
         ("ortho", "ORTHOGRAPHIC"),
     ):
         (folder / f"{name}.json").write_text(json.dumps({**document, "camera_model": model}))
+    (folder / "pixel.json").write_text(
+        json.dumps({**document, "frames": [{**document["frames"][0], "file_path": "1"}]})
+    )
+    write_png(folder / "1.png", np.zeros((1, 1, 3), np.uint8))
     climbing = [{**f, "file_path": "../" + f["file_path"]} for f in document["frames"]]
     (folder / "climb.json").write_text(json.dumps({**document, "frames": climbing}))
     turned = [dict(f) for f in document["frames"]]

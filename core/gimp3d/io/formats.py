@@ -139,7 +139,7 @@ def _from_spz(path: Path) -> Gaussians:
     row = (6 if version == 1 else 9) + 7 + (4 if version >= 3 else 3) + 3 * SPZ_SH_COUNTS[sh_degree]
     require_memory(n * (row + GAUSSIAN), f"{path} with {n} Gaussians")
     size = SPZ_HEADER + n * row  # what its count needs; whatever else is packed there is not unpacked
-    body = _inflated(data, size) if packed else _unpacked_spz_4(data, size, path)
+    body = _inflated(data, size + 1) if packed else _unpacked_spz_4(data, size, path)
     offset = SPZ_HEADER
 
     def take(count: int, kind: str = "u1") -> np.ndarray:
@@ -171,7 +171,7 @@ def _from_spz(path: Path) -> Gaussians:
 
 
 def _inflated(data: bytes, size: int) -> bytes:
-    """The first bytes of what a gzip file holds, of all its members."""
+    """The first bytes of what a gzip file holds, of all its members; if it holds less, its checksums are right."""
     body = b""
     while data and len(body) < size:
         member = zlib.decompressobj(zlib.MAX_WBITS | 16)
