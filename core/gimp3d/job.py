@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ JOB_VERSION = 1
 LARGEST_JOB = 1 << 20  # bytes of a job.json
 MOST_RECORDS = 1000  # of jobs that this user wrote on this machine
 COMMAND = "command:"
+WRITTEN = ("out", "report", "summary", "views_out")  # the paths of a job that are written
 SHADOWS = ("auto", "off", "mask")  # what the object's own shadow is taken for
 
 
@@ -138,22 +140,30 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
 def _refuse_reaching_out(job: RemovalJob, folder: Path, given: Mapping[str, Any], own: bool) -> None:
     """Raise BadInput if a job names what it did not bring, and neither did the user, nor wrote it so themselves."""
     path, root = folder / "job.json", folder.resolve()
-    for name in ("stages", "summary.json"):
-        if not _lies_in(root, folder / name):
-            raise BadInput(f"job: {folder / name} is a link that leads out of the folder; take it away")
+    written = {"stages", "summary.json", *(getattr(job, n) for n in WRITTEN if n not in given)}
+    for link in _links_out(folder, root):
+        place = link.relative_to(folder)
+        if not own or any(place.is_relative_to(w) for w in written if w):
+            raise BadInput(f"job: {link} is a link that leads out of the folder; take it away")
+    if own:
+        return
     stranger = f"job: {path} was not written by you on this machine, and"
     for name in job.PATHS:
         value, option = getattr(job, name), "SCENE" if name == "scene" else f"--{name.replace('_', '-')}"
-        if name in given or value in (None, "none") or _lies_in(root, folder / value):
-            continue
-        if not Path(value).is_absolute():  # save_job writes none of these
-            raise BadInput(f"job: {path}: {option} {value} leads out of the folder; give {option} if you want that")
-        if not own:
+        if name not in given and value not in (None, "none") and not _lies_in(root, folder / value):
             raise BadInput(f"{stranger} {option} leads out of its folder, to {value}; give {option} if you want that")
     for name in ("inpaint", "depth_prior"):
         value, option = getattr(job, name), f"--{name.replace('_', '-')}"
-        if ":" in value and not value.startswith(COMMAND) and name not in given and not own:
+        if name not in given and ":" in value and not value.startswith(COMMAND):
             raise BadInput(f"{stranger} names {option} {value}; give {option} if you want that")
+
+
+def _links_out(folder: Path, root: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(folder):  # links are not followed
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if path.is_symlink() and not _lies_in(root, path):
+                yield path
 
 
 def _lies_in(root: Path, path: Path) -> bool:

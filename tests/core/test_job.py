@@ -65,7 +65,6 @@ LEADING_OUT = {
     "scene": ({"scene": "/home/scene.ply"}, {"scene": "/mine.ply"}),
     "climbing": ({"out": "../../out.ply"}, {"out": "/mine.ply"}),
     "report": ({"report": "/var/www"}, {"report": "/mine"}),
-    "link": ({"out": "link.ply"}, {"out": "/mine.ply"}),
     "model": ({"inpaint": "onnx:/models/x.onnx"}, {"inpaint": "onnx:/mine.onnx"}),
     "prior": ({"depth_prior": "file:depth.npy"}, {"depth_prior": "auto"}),
     "host": ({"inpaint": "http://elsewhere"}, {"inpaint": "exemplar"}),
@@ -75,7 +74,6 @@ LEADING_OUT = {
 @pytest.mark.parametrize("case", LEADING_OUT)
 def test_a_job_from_elsewhere_reaches_out_only_where_the_user_says_so(case: str, tmp_path: Path) -> None:
     named, again = LEADING_OUT[case]
-    (tmp_path / "link.ply").symlink_to(Path.home() / "precious")
     (tmp_path / "job.json").write_text(json.dumps({**FILES, **named}))
     with pytest.raises(BadInput, match=r"leads out|names --") as caught:
         load_job(tmp_path)
@@ -84,13 +82,27 @@ def test_a_job_from_elsewhere_reaches_out_only_where_the_user_says_so(case: str,
     assert getattr(load_job(tmp_path, again), field) == again[field]
 
 
-@pytest.mark.parametrize("name", ["stages", "summary.json"])
-def test_what_a_job_writes_beside_itself_is_no_link_to_elsewhere(name: str, tmp_path: Path) -> None:
-    (tmp_path / "job").mkdir()
-    (tmp_path / "job" / name).symlink_to(tmp_path / "precious")
-    (tmp_path / "job" / "job.json").write_text(json.dumps(FILES))
+LINKS = ("stages", "stages/masks.npz", "summary.json", "report/charts", "views/images", "out.ply", "scene.ply")
+
+
+@pytest.mark.parametrize("name", LINKS)
+@pytest.mark.parametrize("own", [False, True])
+def test_links_in_a_job_do_not_lead_elsewhere(own: bool, name: str, tmp_path: Path) -> None:
+    """Of an own job, those count that would be written through."""
+    folder = tmp_path / "job"
+    job = RemovalJob("scene.ply", "b", "c", "out.ply", report="report", views_out="views").resolved(folder)
+    save_job(folder, job)
+    (folder / "inside").symlink_to("job.json")
+    load_job(folder)
+    if not own:
+        (folder / "job.json").write_text((folder / "job.json").read_text() + " ")
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).symlink_to(tmp_path / "precious")
+    if own and name == "scene.ply":
+        assert load_job(folder) == job
+        return
     with pytest.raises(BadInput, match="link that leads out"):
-        load_job(tmp_path / "job")
+        load_job(folder)
 
 
 def test_a_command_of_a_job_needs_its_own_word_even_in_an_own_job(tmp_path: Path) -> None:

@@ -64,13 +64,12 @@ def test_a_planted_job_runs_nothing(job: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize("field", ["out", "report", "summary", "views_out"])
-@pytest.mark.parametrize("how", ["absolute", "climbing", "link"])
+@pytest.mark.parametrize("how", ["absolute", "climbing"])
 def test_a_planted_job_writes_nowhere_else(
     field: str, how: str, job: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "elsewhere.ply"
-    (job / "link.ply").symlink_to(target)
-    plant(job, **{field: {"absolute": str(target), "climbing": "../elsewhere.ply", "link": "link.ply"}[how]})
+    plant(job, **{field: str(target) if how == "absolute" else "../elsewhere.ply"})
     before = set(tmp_path.rglob("*"))
     assert run(job) == 2
     option = f"--{field.replace('_', '-')}"
