@@ -93,7 +93,7 @@ def try_target(path: Path, is_folder: bool = False) -> None:
             place = place.parent
         with tempfile.TemporaryFile(prefix=".gimp3d-", dir=place):
             pass
-        os.lstat(place / target.name[:255])  # a name that is too long
+        os.lstat(place / target.name)  # fails where the name is too long
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:

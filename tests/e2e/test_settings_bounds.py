@@ -53,9 +53,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+MISSING = {"charts.largest=0": "stages/charts.py divides by it: it needs to be AtLeastOne"}
+
+
+def cases() -> Iterator[Any]:
+    for key, value in bounds():
+        name = f"{key}={value}"
+        marks = [pytest.mark.xfail(strict=True, reason=MISSING[name])] if name in MISSING else []
+        yield pytest.param(key, value, id=name, marks=marks)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="no alarm clock on this system")
-@pytest.mark.parametrize(("key", "value"), [pytest.param(k, v, id=f"{k}={v}") for k, v in bounds()])
+@pytest.mark.parametrize(("key", "value"), cases())
 def test_a_setting_at_its_bound_is_done_or_refused(
     key: str, value: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
