@@ -156,7 +156,9 @@ def test_stopped_after_out_was_written_it_says_so(
 
 
 @posix
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+@pytest.mark.parametrize(
+    ("name", "code"), [("SIGTERM", 143), ("SIGINT", 130), pytest.param("SIGHUP", 129, marks=pytest.mark.slow)]
+)
 def test_a_signal_ends_the_program_with_its_code(name: str, code: int, folder: Path) -> None:
     (folder / "out.ply").write_bytes(b"precious")
     before = contents(folder)
