@@ -227,7 +227,7 @@ def write_orbit(
 ) -> tuple[np.ndarray, str]:
     """Write cameras round a region, for a scene that has none (CONTRACT: orbit); returns what is up, and why."""
     file, region = read_scene(scene), read_region(roi)
-    gaussians = replace(file.gaussians, means=positions(file.table))
+    gaussians = replace(file.gaussians, means=positions(file))
     axis: Any = up
     why = "as given"
     if axis is None:

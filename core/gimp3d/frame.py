@@ -39,7 +39,7 @@ class Frame:
         if self.is_files:
             return file.gaussians
         with np.errstate(over="ignore", invalid="ignore"):
-            means = ((positions(file.table) - self.origin) * self.scale).astype(np.float32)
+            means = ((positions(file) - self.origin) * self.scale).astype(np.float32)
         return replace(file.gaussians, means=means, log_scales=self._sizes(file.gaussians, self.scale))
 
     def camera(self, camera: Camera) -> Camera:
@@ -86,7 +86,7 @@ FILES = Frame(np.zeros(3), 1.0)
 def frame_of(file: SplatFile, cameras: Sequence[Camera]) -> Frame:
     """The frame that suits a scene as these cameras see it."""
     usable = np.flatnonzero(file.gaussians.usable)
-    points = positions(file.table)[usable[:: len(usable) // SAMPLED + 1]]
+    points = positions(file)[usable[:: len(usable) // SAMPLED + 1]]
     depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]
     usual = float(np.nanmedian(depths)) if np.isfinite(depths).any() else np.nan
     if not np.isfinite(usual) or usual <= 0:

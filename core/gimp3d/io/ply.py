@@ -352,9 +352,11 @@ def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
     )
 
 
-def positions(table: PlyTable) -> np.ndarray:
+def positions(file: SplatFile) -> np.ndarray:
     """The Gaussians' centres in the file's own precision, [N, 3] float64."""
-    records = values(table)
+    if all(TYPES[p.type] == "f4" for p in file.table.properties if p.name in "xyz"):
+        return file.gaussians.means.astype(np.float64)
+    records = values(file.table)
     return np.stack([records[n].astype(np.float64) for n in "xyz"], -1)
 
 

@@ -329,7 +329,7 @@ def little_memory() -> Iterator[None]:
 
 def gzipped_zeros(path: Path, start: bytes, size: int) -> None:
     """`start` and then zeros, packed without ever lying in memory as a whole."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    packer = zlib.compressobj(1, zlib.DEFLATED, 31)
     with path.open("wb") as file:
         file.write(packer.compress(start))
         for _ in range(size >> 20):
@@ -343,14 +343,14 @@ def test_a_file_takes_no_more_memory_than_its_count_needs(tmp_path: Path) -> Non
     def header(count: int) -> bytes:
         return b"NGSP" + struct.pack("<IIBBBB", 2, count, 0, 12, 0, 0)
 
-    gzipped_zeros(tmp_path / "few.spz", header(2), 300 << 20)  # the rest is never unpacked
+    gzipped_zeros(tmp_path / "few.spz", header(2), 128 << 20)  # the rest is never unpacked
     assert len(read_scene(tmp_path / "few.spz").gaussians) == 2
-    gzipped_zeros(tmp_path / "many.spz", header(16 << 20), 300 << 20)
+    gzipped_zeros(tmp_path / "many.spz", header(16 << 20), 128 << 20)
     with pytest.raises(MemoryError, match="16777216 Gaussians"):
         read_scene(tmp_path / "many.spz")
     whole = zipfile.ZipFile(tmp_path / "meta.sog", "w", zipfile.ZIP_DEFLATED)
     with whole as archive, archive.open("meta.json", "w") as meta:
-        for _ in range(300):
+        for _ in range(20):
             meta.write(b" " * (1 << 20))
     with pytest.raises(BadInput, match="larger than 16 MiB"):
         read_scene(tmp_path / "meta.sog")
