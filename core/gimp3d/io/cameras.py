@@ -397,7 +397,8 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             folder,
         )
     cameras = []
-    for name, lens, quat, translation in poses:
+    for number, (given, lens, quat, translation) in enumerate(poses):
+        name = camera_id(given, f"{model}, image {number}")
         where = f"{model}, image {name}"
         if lens not in lenses:
             raise BadInput(f"{where}: its camera {lens} is not in the model")
@@ -408,7 +409,7 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             raise BadInput(f"{where}: the pose is not finite")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quats_to_matrices(np.array([quat]))[0], translation
-        photo = images / camera_id(name, where)
+        photo = images / name
         cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, "train", photo))
     return tuple(sorted(cameras, key=lambda c: c.id))
 

@@ -303,3 +303,14 @@ def test_a_pose_that_another_program_changed_counts(views: tuple[Camera, ...], t
     back = read_cameras(tmp_path / "t.json")
     assert back[0].centre[0] == pytest.approx(views[0].centre[0] + 1e-6, abs=1e-12)
     assert np.allclose(back[1].viewmat, views[1].viewmat, atol=1e-12)
+
+
+def test_a_colmap_name_that_no_file_can_have_is_said_in_one_line(views: tuple[Camera, ...], tmp_path: Path) -> None:
+    """Found by make fuzz."""
+    colmap(tmp_path, views, binary=True)
+    whole = (tmp_path / "images.bin").read_bytes()
+    name = views[0].id.encode()
+    (tmp_path / "images.bin").write_bytes(whole.replace(name, b"\n" + name[1:]))
+    with pytest.raises(BadInput, match="no file can") as caught:
+        read_cameras(tmp_path)
+    assert "\n" not in str(caught.value)
