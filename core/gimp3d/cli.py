@@ -19,9 +19,6 @@ from typing import Any, NoReturn, TextIO
 # Before NumPy is imported: the kernels have a thread pool of their own, and OpenBLAS's threads, which spin while they
 # wait for its small products, cost as much processor time again.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Before OpenCV is: a picture's header may claim any size, and what is wrong with one is said by us.
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 28))
-os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 from . import __version__
 from .errors import BadInput, Cancelled, Gimp3dError, Terminated
