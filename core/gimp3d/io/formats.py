@@ -25,6 +25,7 @@ from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 SPZ_MAGIC = b"NGSP"
 SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
+DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
 SPZ_HEADER = 16  # bytes
 LARGEST_META = 16 << 20  # bytes of a SOG's meta.json; codebooks have 256 entries
 LARGEST_PACKED = 1 << 31  # bytes of a SOG's picture
@@ -60,7 +61,7 @@ def read_scene(path: Path | str) -> SplatFile:
             return file_of(_from_splat(path))
     except OSError as error:
         raise BadInput(f"cannot read {path} ({error.strerror or error})") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
+    except DAMAGE as error:
         raise BadInput(f"{path} is damaged ({error})") from None
     raise BadInput(f"{path} is not a PLY, nor a .splat, .spz or .sog scene")
 

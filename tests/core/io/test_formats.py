@@ -399,6 +399,18 @@ def test_a_description_that_makes_no_sense_is_refused(case: str, tmp_path: Path)
         read_scene(tmp_path)
 
 
+def test_an_archive_with_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Found by make fuzz."""
+    files = {**sog_files(some(10)), "ä.txt": b""}
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    whole = (tmp_path / "a.sog").read_bytes()
+    (tmp_path / "a.sog").write_bytes(whole.replace("ä".encode(), b"\xab\xab"))
+    with pytest.raises(BadInput, match="damaged"):
+        read_scene(tmp_path / "a.sog")
+
+
 def test_a_picture_far_larger_than_the_count_needs_is_refused(tmp_path: Path) -> None:
     files = sog_files(some(10))
     files["quats.webp"] = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[
