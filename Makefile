@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-fill bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules extension \
+	bench-harmonics bench-nnf bench-inpaint bench-fill bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -100,6 +100,23 @@ bench-stability: $(READY)
 # desk with every Gaussian split in ten and 200 views of 960 × 540
 bench-large: $(READY)
 	$(BIN)/python scripts/bench_large.py $(DATA)/desk
+
+# bad inputs, faults, kills and moved scenes: the table of docs/reliability.md, in less than half an hour
+bench-faults: $(READY)
+	$(BIN)/python scripts/bench_faults.py
+
+# changed files for every reader, guided by coverage where atheris can be installed: hours; goes on where it stopped
+FUZZ := build/fuzz/venv
+
+$(FUZZ)/.ready: $(READY)
+	$(BIN)/python -m venv $(FUZZ)
+	echo "import site; site.addsitedir('$(CURDIR)/$(VENV)/lib/python3.11/site-packages')" > \
+		$$($(FUZZ)/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/project.pth
+	$(FUZZ)/bin/python -m pip install --quiet atheris==3.0.0 || echo "atheris cannot be installed here; cases are made by number"
+	@touch $@
+
+fuzz: $(FUZZ)/.ready
+	$(FUZZ)/bin/python scripts/fuzz.py
 
 # scikit-image's photographs and other programs' fills come from an environment of their own
 OTHERS := build/others

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+os.environ["GIMP3D_STATE"] = tempfile.mkdtemp(prefix="gimp3d-state-")  # records and logs of the tests are nobody's
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))  # light_scenes.py

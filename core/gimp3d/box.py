@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from .errors import BadInput
 from .gaussians import matrices_to_quats, quats_to_matrices
+from .schema import checked, read_json
+
+LARGEST_ROI = 1 << 20  # bytes of a ROI's file
+MOST_BOXES = 50
+LARGEST = 1e30  # scene units
 
 
 @dataclass(frozen=True)
@@ -32,10 +36,10 @@ class Box:
         """
         try:
             c, s, q = (np.array(v, dtype=np.float64) for v in (center, size, rotation_wxyz))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RecursionError) as error:
             raise BadInput(f"ROI: numbers expected for center, size and rotation_wxyz ({error})") from None
         for name, value, length in (("center", c, 3), ("size", s, 3), ("rotation_wxyz", q, 4)):
-            if value.shape != (length,) or not np.isfinite(value).all():
+            if value.shape != (length,) or not (np.abs(value) < LARGEST).all():  # NaN is not less either
                 raise BadInput(f"ROI: {name} must be {length} finite numbers")
         if (s <= 0).any():
             raise BadInput(f"ROI: size must be positive, got {s.tolist()}")
@@ -98,7 +102,7 @@ def box_from_matrix(
     """
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
-    if (lengths < 1e-12).any():
+    if not (lengths > 1e-12 * lengths.max()).all():
         raise BadInput("ROI: the box is flat; give it a volume")
     axes = linear / lengths
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-4:
@@ -118,16 +122,23 @@ def read_region(path: Path | str) -> Region:
         If the file is missing, is not JSON, or a box is malformed.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInput(f"ROI: cannot read {path} ({error.strerror})") from None
-    except ValueError as error:
-        raise BadInput(f"ROI: {path} is not JSON ({error})") from None
+    data = read_json(path, "ROI", LARGEST_ROI)
     boxes = data if isinstance(data, list) else [data]
     if not boxes:
         raise BadInput(f"ROI: {path} holds no box")
+    if len(boxes) > MOST_BOXES:
+        raise BadInput(f"ROI: {path} holds {len(boxes)} boxes; {MOST_BOXES} are the most, each costs time")
     for box in boxes:
         if not isinstance(box, dict) or not {"center", "size"} <= set(box):
             raise BadInput(f'ROI: {path} must hold {{"center", "size", "rotation_wxyz"}} or a list of such boxes')
-    return tuple(Box.make(b["center"], b["size"], b.get("rotation_wxyz", (1, 0, 0, 0))) for b in boxes)
+    read = (checked(_Entry, box, f"ROI: {path}", extra=True) for box in boxes)
+    return tuple(Box.make(b.center, b.size, b.rotation_wxyz) for b in read)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A box of a ROI file."""
+
+    center: list[float]
+    size: list[float]
+    rotation_wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])

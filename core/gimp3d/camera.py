@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,7 +27,13 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Camera:
-    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies."""
+    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies.
+
+    Raises
+    ------
+    ValueError
+        If the picture has no pixels, or a number is not finite.
+    """
 
     id: str  # file_path / image name / img_name, as the camera file gives it
     width: int  # pixels
@@ -39,6 +46,14 @@ class Camera:
     split: str = "train"
     image: Path | None = None  # the photo, if one is known; may not exist
     distortion: Distortion | None = None
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera {self.id}: a picture of {self.width}×{self.height} pixels")
+        if self.viewmat.shape != (4, 4) or not np.isfinite(self.viewmat).all():
+            raise ValueError(f"camera {self.id}: viewmat must be 4×4 finite numbers")
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy))):
+            raise ValueError(f"camera {self.id}: focal lengths and centre must be finite")
 
     @property
     def K(self) -> np.ndarray:

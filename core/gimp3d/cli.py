@@ -9,19 +9,22 @@ import re
 import signal
 import sys
 import time
+import traceback
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 # Before NumPy is imported: the kernels have a thread pool of their own, and OpenBLAS's threads, which spin while they
 # wait for its small products, cost as much processor time again.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from . import __version__
-from .errors import BadInput, Cancelled, Gimp3dError
-from .job import SHADOWS, RemovalJob, load_job, save_job
+from .errors import BadInput, Cancelled, Gimp3dError, Terminated
+from .files import identity, user_state_folder, write_atomically
+from .job import PROVIDERS, SHADOWS, RemovalJob, load_job, save_job
+from .memory import require_base_memory
 
 Namespace = argparse.Namespace
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH|torchscript:PATH|command:CMD, then ,disparity|,depth|,metric"
@@ -100,11 +103,10 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--reference-image", metavar="FILE", help="that view or chart without the object")
     remove.add_argument(
         "--inpaint",
-        default="exemplar",
         metavar="PROVIDER",
         help=f"exemplar|telea|ns|shiftmap|fsr|{PAINTERS}",
     )
-    remove.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
+    remove.add_argument("--depth-prior", metavar="PROVIDER", help=DEPTH_PRIORS)
     remove.add_argument("--refine-views", metavar="PROVIDER", help=REFINERS)
     remove.add_argument("--allow-network", action="store_true", help=NETWORK)
     remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
@@ -113,6 +115,7 @@ def build_parser() -> argparse.ArgumentParser:
     remove.add_argument("--report", metavar="DIR", help="write an HTML report with stage pictures")
     remove.add_argument("--summary", metavar="FILE.json")
     remove.add_argument("--job", metavar="DIR", help="keep every stage here; alone: run the job prepared there")
+    remove.add_argument("--allow-command", action="store_true", help="run the command that the job in --job names")
     remove.add_argument("--resume", action="store_true", help="go on from the finished stages in --job")
     remove.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     remove.add_argument("--seed", type=int, default=0)
@@ -156,29 +159,57 @@ def _running(parser: argparse.ArgumentParser) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code (CONTRACT: 0, 2, 3, 130)."""
+    """Run a command; returns the exit code (CONTRACT: 0, 1, 2, 3, 129, 130, 143)."""
     shown = Reporter("none")
     try:
         given = build_parser().parse_args(arguments)
         shown = Reporter("none" if getattr(given, "quiet", False) else getattr(given, "progress", "none"))
+        if given.command in COMPILED:
+            require_base_memory()
         COMMANDS[given.command](given, shown)
         return 0
     except Gimp3dError as error:
         return _fail(shown, error.exit_code, str(error))
+    except Terminated as stop:
+        return _fail(shown, stop.exit_code, "terminated; nothing was changed")
     except KeyboardInterrupt:
         return _fail(shown, Cancelled.exit_code, "interrupted; nothing was changed")
-    except MemoryError:
-        return _fail(shown, 3, "out of memory; use fewer or smaller views")
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone; there is nobody left to tell
-        return 0
+    except MemoryError as error:
+        return _fail(shown, 3, f"out of memory: {error or 'no more is free'}; use fewer or smaller views")
+    except Exception as error:
+        return _fail(shown, 1, f"unforeseen fault ({type(error).__name__}: {error}); {_logged(arguments)}")
 
 
 def _fail(shown: Reporter, code: int, message: str) -> int:
     line = re.sub(r"\s+", " ", message)
     shown.error(line)
-    print(f"gimp3d: error: {line}", file=sys.stderr)
+    say(f"gimp3d: error: {line}", sys.stderr)
     return code
+
+
+def _logged(arguments: Sequence[str] | None) -> str:
+    """Write down the exception that is being handled; says where."""
+    words = (
+        f"gimp3d {__version__}, {sys.version}, {sys.platform}\n{arguments or sys.argv[1:]}\n{traceback.format_exc()}"
+    )
+    path = user_state_folder() / "logs" / f"{time.strftime('%Y-%m-%d-%H%M%S')}-{os.getpid()}.log"
+    try:
+        write_atomically(path, lambda f: f.write(words.encode("utf-8", "backslashreplace")))
+        for stale in sorted(path.parent.glob("*.log"))[:-MOST_LOGS]:
+            stale.unlink()
+    except (Gimp3dError, OSError):
+        return "its log could not be written"
+    return f"please report it with its log, {path}"
+
+
+def say(text: str, stream: TextIO | None, end: str = "\n") -> None:
+    """Print, whatever has become of the stream: a run does not depend on whether somebody listens."""
+    if stream is None:
+        return
+    with suppress(OSError, ValueError):
+        coding = stream.encoding or "utf-8"
+        stream.write(text.encode(coding, "backslashreplace").decode(coding) + end)
+        stream.flush()
 
 
 class Reporter:
@@ -190,22 +221,20 @@ class Reporter:
 
     def __call__(self, stage: str, done: int, total: int, message: str = "") -> None:
         if self.kind == "json":
-            print(json.dumps({"stage": stage, "done": done, "total": total, "message": message}), flush=True)
+            say(json.dumps({"stage": stage, "done": done, "total": total, "message": message}), sys.stdout)
         elif self.kind == "bar":
             filled = 24 * done // max(1, total)
             line = f"{stage:<14} [{'#' * filled}{'.' * (24 - filled)}] {done}/{total} {message}"[:110]
-            end = "\n" if done >= total else "\r"
-            sys.stderr.write(f"\r{line:<{self._width}}{end}")
-            sys.stderr.flush()
+            say(f"\r{line:<{self._width}}", sys.stderr, "\n" if done >= total else "\r")
             self._width = 0 if done >= total else len(line)
 
     def done(self, summary: dict[str, Any]) -> None:
         if self.kind == "json":
-            print(json.dumps({"stage": "done", "summary": summary}), flush=True)
+            say(json.dumps({"stage": "done", "summary": summary}), sys.stdout)
 
     def error(self, message: str) -> None:
         if self.kind == "json":
-            print(json.dumps({"stage": "error", "message": message}), flush=True)
+            say(json.dumps({"stage": "error", "message": message}), sys.stdout)
 
 
 def _info(given: Namespace, _: Reporter) -> None:
@@ -213,10 +242,10 @@ def _info(given: Namespace, _: Reporter) -> None:
 
     facts = scene_info(Path(given.scene))
     if given.json:
-        print(json.dumps(facts, indent=1))
+        say(json.dumps(facts, indent=1), sys.stdout)
     else:
         for key, value in facts.items():
-            print(f"{key.replace('_', ' '):<22} {value}")
+            say(f"{key.replace('_', ' '):<22} {value}", sys.stdout)
 
 
 def _convert(given: Namespace, _: Reporter) -> None:
@@ -270,38 +299,47 @@ def _remove(given: Namespace, shown: Reporter) -> None:
     from .pipeline import provider_notices
 
     folder = Path(given.job) if given.job else None
-    if folder and given.scene is None:
-        job = load_job(folder)
-        changes = {k: getattr(given, k) for k in ("summary", "report", "views_out", "threads") if getattr(given, k)}
-        job = replace(job, **changes)
-    else:
-        missing = [f"--{k}" for k in ("cameras", "roi", "out") if getattr(given, k) is None]
-        if given.scene is None:
-            missing.insert(0, "SCENE")
-        if missing:
-            raise BadInput(f"remove needs {', '.join(missing)} (or --job DIR alone, to run a prepared job)")
-        if given.resume and not folder:
-            raise BadInput("--resume needs --job DIR, the folder of the run to go on with")
-        values = {f: getattr(given, f) for f in RemovalJob.__dataclass_fields__ if f != "set"}
-        job = RemovalJob(**values, set=_settings(given.set))
-        if folder:
-            save_job(folder, job)
+    job = _job(given, folder)
+    before = identity(Path(job.out))
     start = time.perf_counter()
     for notice in provider_notices(job_settings(job), given.allow_network):
         print(f"gimp3d: note: {notice}", file=sys.stderr)
-    summary = run_removal(job, folder, given.resume, shown, given.allow_network)
+    try:
+        summary = run_removal(job, folder, given.resume, shown, given.allow_network)
+    except KeyboardInterrupt:
+        if identity(Path(job.out)) in (before, None):
+            raise
+        say(f"gimp3d: warning: interrupted after {job.out} was written, which is complete", sys.stderr)
+        return
     shown.done(summary)
     if not given.quiet and given.progress == "bar":
         counts = summary["counts"]
-        print(
-            f"removed {counts['removed']} and added {counts['added']} Gaussians in "
-            f"{time.perf_counter() - start:.1f} s: {job.out}"
-        )
+        seconds = time.perf_counter() - start
+        words = f"removed {counts['removed']} and added {counts['added']} Gaussians in {seconds:.1f} s: {job.out}"
+        say(words, sys.stdout)
         if summary["verdict"]:
-            print(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}")
+            say(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}", sys.stdout)
     if given.progress != "json":
         for warning in summary["warnings"]:
-            print(f"gimp3d: warning: {warning}", file=sys.stderr)
+            say(f"gimp3d: warning: {warning}", sys.stderr)
+
+
+def _job(given: Namespace, folder: Path | None) -> RemovalJob:
+    """The removal that the options describe, or the one that is prepared in the folder."""
+    options = {f: getattr(given, f) for f in RemovalJob.__dataclass_fields__ if f != "set"}
+    options = {f: value for f, value in options.items() if value is not None}
+    missing = [f"--{k}" if k != "scene" else "SCENE" for k in ("scene", "cameras", "roi", "out") if k not in options]
+    if folder and missing and (given.scene is None or (folder / "job.json").is_file()):
+        again = {f: value for f, value in options.items() if f in GIVEN_AGAIN}
+        return load_job(folder, again, given.allow_command)
+    if missing:
+        raise BadInput(f"remove needs {', '.join(missing)} (or --job DIR alone, to run a prepared job)")
+    if given.resume and not folder:
+        raise BadInput("--resume needs --job DIR, the folder of the run to go on with")
+    job = RemovalJob(**options, set=_settings(given.set))
+    if folder:
+        save_job(folder, job)
+    return job
 
 
 def _orbit(given: Namespace, _: Reporter) -> None:
@@ -320,12 +358,11 @@ def _orbit(given: Namespace, _: Reporter) -> None:
         height=int(size[2]),
         fov_degrees=given.fov,
     )
-    print(f"{given.out}: {given.views} cameras; up is {up[0]:.2f},{up[1]:.2f},{up[2]:.2f} ({why})")
+    say(f"{given.out}: {given.views} cameras; up is {up[0]:.2f},{up[1]:.2f},{up[2]:.2f} ({why})", sys.stdout)
 
 
 def _evaluate(given: Namespace, _: Reporter) -> None:
     from .evaluate.metrics import evaluate_folders
-    from .job import write_atomically
 
     scores = evaluate_folders(
         Path(given.pred),
@@ -337,10 +374,10 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
     if given.json:
         write_atomically(Path(given.json), lambda f: f.write(json.dumps(scores, indent=1).encode()))
     for warning in scores["warnings"]:
-        print(f"gimp3d: warning: {warning}", file=sys.stderr)
-    print(f"{'view':<20} {'PSNR dB':>8} {'SSIM':>7} {'FLIP':>7}")
+        say(f"gimp3d: warning: {warning}", sys.stderr)
+    say(f"{'view':<20} {'PSNR dB':>8} {'SSIM':>7} {'FLIP':>7}", sys.stdout)
     for name, row in [*scores["views"].items(), ("mean", scores["mean"])]:
-        print(f"{name:<20} {row['psnr']:8.2f} {row['ssim']:7.3f} {row['flip']:7.3f}")
+        say(f"{name:<20} {row['psnr']:8.2f} {row['ssim']:7.3f} {row['flip']:7.3f}", sys.stdout)
 
 
 def _bench(given: Namespace, shown: Reporter) -> None:
@@ -354,9 +391,12 @@ def _bench(given: Namespace, shown: Reporter) -> None:
         raise BadInput(f"--presets: no preset {', '.join(unknown)}; there are {', '.join(PRESETS)}")
     set_thread_count(given.threads)
     rows = run_benchmark(Path(given.data), Path(given.out), _names(given.scenes) or (), presets, shown)
-    print(table(rows))
+    say(table(rows), sys.stdout)
 
 
+COMPILED = {"render", "masks", "remove", "bench"}  # commands that need the kernels
+MOST_LOGS = 20
+GIVEN_AGAIN = (*RemovalJob.PATHS, *PROVIDERS, "threads")  # what replaces a prepared job's
 COMMANDS = {
     "info": _info,
     "convert": _convert,
@@ -392,12 +432,37 @@ def _settings(pairs: Sequence[str]) -> dict[str, str]:
 
 def entry_point() -> None:
     """The `gimp3d` program: a terminated run ends like an interrupted one."""
-    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    code = main()
-    with suppress(OSError, ValueError):  # the reader of our output may have gone
+    _open_streams()
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # what matters is said by us, in a line
+
+    def stop(number: int, _: Any) -> NoReturn:
+        raise Terminated(number)
+
+    try:
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), stop)
+        code = main()
+    except SystemExit as end:  # --help
+        code = int(end.code or 0)
+    except Terminated as end:
+        code = end.exit_code
+    except KeyboardInterrupt:
+        code = Cancelled.exit_code
+    with suppress(OSError, ValueError, AttributeError, KeyboardInterrupt):  # the reader of our output may have gone
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(code)  # all files are closed; taking the interpreter down piece by piece takes a third of a second
+
+
+def _open_streams() -> None:
+    """A standard stream that is closed leads nowhere, so that no file of ours takes its number and gets its text."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
 
 
 if __name__ == "__main__":

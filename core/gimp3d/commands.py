@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,13 +17,16 @@ from . import __version__
 from .box import read_region
 from .camera import Camera, output_name
 from .errors import BadInput
+from .files import is_stream, sweep, try_target, write_atomically
+from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
-from .io.ply import SplatFile, write_gaussians, write_ply
+from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .jit import announce_compilation
-from .job import SHADOWS, RemovalJob, write_atomically
+from .job import SHADOWS, RemovalJob
+from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pipeline import (
     PRESETS,
@@ -39,7 +42,8 @@ from .pipeline import (
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
-from .stages.charts import chart_number
+from .schema import within
+from .stages.charts import Chart, chart_number
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
 from .threads import parallel_map, set_thread_count
@@ -72,6 +76,7 @@ def convert(source: Path, target: Path) -> None:
     """Write a scene of any kind that `read_scene` knows as a plain binary PLY in Inria's layout."""
     if target.suffix.lower() != ".ply":
         raise BadInput(f"convert: {target} must end in .ply")
+    try_target(target)
     write_gaussians(target, read_scene(source).gaussians)
 
 
@@ -118,19 +123,22 @@ def render_views(
         raise BadInput(f"render: --scale must be in (0, 16], got {scale}")
     if not all(0 <= b <= 1 for b in background):
         raise BadInput("render: --background takes three numbers from 0 to 1")
-    gaussians = read_scene(scene).gaussians
+    try_target(out, is_folder=True)
+    file = read_scene(scene)
     chosen = select_cameras(read_cameras(cameras), split, frames)
+    frame = frame_of(file, chosen)
+    gaussians = frame.scene(file)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
     for done, camera in enumerate(chosen, 1):
-        drawn = render(gaussians, undistorted(camera).scaled(scale), raster, frozenset(passes))
+        drawn = render(gaussians, frame.camera(undistorted(camera).scaled(scale)), raster, frozenset(passes))
         target = out / output_name(camera.id)
         if "rgb" in passes:
             write_png(target.with_name(target.name + ".png"), to_bytes(drawn.rgb))
         if "alpha" in passes:
             write_png(target.with_name(target.name + ".alpha.png"), to_bytes(drawn.alpha))
         if "depth" in passes:
-            _write_npy(target.with_name(target.name + ".depth.npy"), drawn.median_depth)
+            _write_npy(target.with_name(target.name + ".depth.npy"), drawn.median_depth / np.float32(frame.scale))
         if "normal" in passes:
             _write_npy(target.with_name(target.name + ".normal.npy"), drawn.normals)
         progress("render", done, len(chosen), camera.id)
@@ -142,7 +150,7 @@ def write_masks(
     roi: Path,
     out: Path,
     images: str | None = None,  # folder; "none": views are rendered from the scene itself
-    mode: str = "need",
+    mode: Literal["need", "paper"] = "need",
     grow: bool = False,
     split: str = "train",
     frames: Sequence[str] | None = None,
@@ -162,13 +170,17 @@ def write_masks(
     removal would use, charts/, see `write_charts`.
     """
     _use_threads(threads)
-    gaussians, region = read_scene(scene).gaussians, read_region(roi)
+    for folder in (out, *([pictures] if pictures else [])):
+        try_target(folder, is_folder=True)
+    file, region = read_scene(scene), read_region(roi)
     available = read_cameras(cameras, _images_folder(images))
+    frame = frame_of(file, available)
+    gaussians, region = frame.scene(file), frame.region(region)
     written = select_cameras(available, split, frames)
     names = {c.id for c in written}
     looked_at = [c for c in available if c.split == "train" or c.id in names]  # in the file's order, as a removal does
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    loaded, _ = _load_views(looked_at, images, gaussians)
+    loaded, _ = _load_views(looked_at, images, gaussians, frame)
     photos = {v.camera.id: v.image for v in loaded}
     settings = RemovalSettings(masks=MaskSettings(mode=mode, grow=grow), depth_prior=depth_prior)
     settings = replace(settings, shadow=_shadow(shadow, shadow_masks))
@@ -184,13 +196,13 @@ def write_masks(
     marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
     found, charts, lit = with_charts(gaussians, region, found, photos, settings, marked)
     if pictures:
-        proposed = json.dumps(found.proposed)
+        proposed = json.dumps(_proposed(found.proposed, frame))
         write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
     if pictures:
         light = json.dumps({"shadow": lit.shadow, "reflection": lit.reflection})
         write_atomically(pictures / "light.json", lambda f: f.write(light.encode()))
     if pictures and all(c.split == "train" for c in written):
-        write_charts(pictures / "charts", charts)
+        write_charts(pictures / "charts", _charts_back(charts, frame))
     views = {v.camera.id: v for v in found.views}
     for camera in written:
         view = views.get(camera.id)
@@ -214,7 +226,8 @@ def write_orbit(
     fov_degrees: float = 50.0,
 ) -> tuple[np.ndarray, str]:
     """Write cameras round a region, for a scene that has none (CONTRACT: orbit); returns what is up, and why."""
-    gaussians, region = read_scene(scene).gaussians, read_region(roi)
+    file, region = read_scene(scene), read_region(roi)
+    gaussians = replace(file.gaussians, means=positions(file))
     axis: Any = up
     why = "as given"
     if axis is None:
@@ -239,15 +252,20 @@ def run_removal(
         raise BadInput("--device cuda: there is no CUDA backend yet; use cpu or auto")
     settings = job_settings(job)
     out = Path(job.out)
-    if out.suffix.lower() != ".ply":
+    if out.suffix.lower() != ".ply" and not is_stream(out):
         raise BadInput(f"--out: {out} must end in .ply")
+    _try_targets(job, folder)
     progress("read", 0, 1, job.scene)
     file = read_scene(Path(job.scene))
     region = read_region(Path(job.roi))
     cameras = _removal_cameras(job)
+    pixels = sum(c.width * c.height for c in cameras)
+    require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
     warnings = list(_scene_warnings(file))
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    views, rendered = _load_views(cameras, job.images, file.gaussians)
+    frame = frame_of(file, cameras)
+    scene = frame.scene(file)
+    views, rendered = _load_views(cameras, job.images, scene, frame)
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     given = read_image(Path(job.reference_image)) if job.reference_image else None
@@ -256,11 +274,14 @@ def run_removal(
         for option, folder in (("--extra-masks", job.extra_masks), ("--shadow-masks", job.shadow_masks))
     )
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
-    store = StageStore(folder / "stages", _job_key(job, views, (extra, shadow)), STORED, resume) if folder else None
+    store = None
+    if folder:
+        key = _job_key(job, views, (extra, shadow))
+        store = StageStore(folder / "stages", key, STORED, resume, asdict(settings))
     result = remove_object(
-        file.gaussians,
+        scene,
         views,
-        region,
+        frame.region(region),
         settings,
         _clean_id(job.reference),
         given,
@@ -270,7 +291,7 @@ def run_removal(
         shadow,
         allow_network,
     )
-    write_ply(out, file, result.keep, result.added)
+    result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
     if job.views_out:
         for name, image in result.painted.items():
             target = Path(job.views_out) / output_name(name)
@@ -278,10 +299,22 @@ def run_removal(
         write_charts(Path(job.views_out) / "charts", result.charts)
     summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
-        write_removal_report(Path(job.report), file.gaussians, views, result, summary)
+        write_removal_report(Path(job.report), scene, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
+    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
     return summary
+
+
+def _try_targets(job: RemovalJob, folder: Path | None) -> None:
+    """Sweep what killed runs left half-written, and see that everything can be written before the work starts."""
+    files = [Path(p) for p in (job.out, job.summary, folder and folder / "summary.json") if p]
+    folders = [Path(p) for p in (job.report, job.views_out, folder and folder / "stages") if p]
+    sweep([*(f.parent for f in files), *folders])
+    for path in files:
+        try_target(path)
+    for path in folders:
+        try_target(path, is_folder=True)
 
 
 def job_settings(job: RemovalJob) -> RemovalSettings:
@@ -306,10 +339,11 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
         settings = replace(settings, shadow=shadow)
     for key, text in job.set.items():
         settings = _with(settings, key.split("."), text, key)
+    within(settings, "--set: ")
     return settings
 
 
-def _shadow(shadow: str, masks: Path | str | None) -> str:
+def _shadow(shadow: str, masks: Path | str | None) -> Any:
     if shadow not in SHADOWS:
         raise BadInput(f"--shadow: {shadow!r} is not one of {', '.join(SHADOWS)}")
     if (shadow == "mask") != (masks is not None):
@@ -361,19 +395,34 @@ def _images_folder(images: str | None) -> Path | None:
     return Path(images) if images and images != "none" else None
 
 
-def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians) -> tuple[list[View], int]:
-    """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene."""
+def _load_views(
+    cameras: Sequence[Camera], images: str | None, scene: Gaussians, frame: Frame
+) -> tuple[list[View], int]:
+    """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene.
+
+    The scene and the views' cameras are in the frame, the cameras given are the file's.
+    """
 
     def load(camera: Camera) -> tuple[View, bool]:
         wanted = images != "none" and camera.split == "train"
         if wanted and camera.image is not None and camera.image.exists():
             image, pinhole = load_view(camera)
-            return View(pinhole, image), False
-        pinhole = undistorted(camera)
+            return View(frame.camera(pinhole), image), False
+        pinhole = frame.camera(undistorted(camera))
         return View(pinhole, render_bytes(scene, pinhole), is_photo=False), wanted
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
+
+
+def _proposed(proposed: dict[str, Any], frame: Frame) -> dict[str, Any]:
+    return {**proposed, "box": frame.box_back(proposed["box"])} if proposed else proposed
+
+
+def _charts_back(charts: Sequence[Chart], frame: Frame) -> tuple[Chart, ...]:
+    """Charts whose cameras are in the file's frame."""
+    back = frame.cameras_back([c.camera for c in charts])
+    return tuple(replace(chart, camera=camera) for chart, camera in zip(charts, back))
 
 
 def _read_marks(option: str, folder: Path | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:

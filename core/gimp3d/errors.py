@@ -19,6 +19,14 @@ class IllPosed(Gimp3dError):
     exit_code = 3
 
 
+class Terminated(KeyboardInterrupt):
+    """The system asked to stop (SIGTERM, SIGHUP); like Ctrl-C, no `except Exception` may swallow it."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal_number)
+        self.exit_code = 128 + signal_number
+
+
 class Cancelled(Gimp3dError):
     """The caller asked to stop."""
 

@@ -1,24 +1,32 @@
 """The job folder: everything a removal needs and everything it made, so that it can resume or move.
 
 DIR/job.json      the RemovalJob; paths inside are relative to DIR where possible
-DIR/stages/       one .npz (+ .json) per finished stage, with a key of its inputs
+DIR/stages/       one .npz per finished stage, with a key of its inputs
 DIR/summary.json  written at the end
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import tempfile
-from collections.abc import Callable
+import secrets
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Annotated, Any, Literal
 
 from .errors import BadInput
+from .files import require_file, user_state_folder, write_atomically
+from .schema import SETTING, Between, checked, kinds, parse_json
 
 JOB_VERSION = 1
+LARGEST_JOB = 1 << 20  # bytes of a job.json
+MOST_RECORDS = 1000  # of jobs that this user wrote on this machine
+COMMAND = "command:"
+PROVIDERS = ("inpaint", "depth_prior", "refine_views")  # fields and settings that may name a program, host or model
+WRITTEN = ("out", "report", "summary", "views_out")  # the paths of a job that are written
 SHADOWS = ("auto", "off", "mask")  # what the object's own shadow is taken for
 
 
@@ -32,7 +40,7 @@ class RemovalJob:
     out: str
     images: str | None = None  # folder; "none": views are rendered from the scene itself
     extra_masks: str | None = None  # folder of masks that are filled too: shadows, reflections
-    shadow: str = "auto"  # one of SHADOWS
+    shadow: Literal["auto", "off", "mask"] = "auto"
     shadow_masks: str | None = None  # folder of masks of the object's shadow
     reference: str | None = None
     reference_image: str | None = None
@@ -45,8 +53,8 @@ class RemovalJob:
     report: str | None = None
     summary: str | None = None
     device: str = "auto"
-    threads: int | None = None
-    seed: int = 0
+    threads: Annotated[int, Between(1, 1024)] | None = None
+    seed: Annotated[int, Between(0, 2**32 - 1)] = 0
     grow: bool = False  # take along what of the object the boxes cut off
 
     PATHS = (
@@ -77,62 +85,115 @@ class RemovalJob:
 
 
 def save_job(folder: Path, job: RemovalJob) -> None:
-    """Write `folder`/job.json (atomically), making the folder if needed."""
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {"version": JOB_VERSION, **asdict(job.relative_to(folder))}
-    write_atomically(folder / "job.json", lambda f: f.write(json.dumps(document, indent=1).encode()))
+    """Write `folder`/job.json (atomically), making the folder if needed, and remember that this user wrote it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"job: cannot make the folder {folder} ({error.strerror})") from None
+    # The mark makes the file's content one that nobody else can have written, see _remember.
+    document = {"version": JOB_VERSION, "mark": secrets.token_hex(16), **asdict(job.relative_to(folder))}
+    text = json.dumps(document, indent=1).encode()
+    write_atomically(folder / "job.json", lambda f: f.write(text))
+    _remember(_record(text))
 
 
-def load_job(folder: Path) -> RemovalJob:
+def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command: bool = False) -> RemovalJob:
     """Read a job folder; its paths come back absolute.
 
+    A job from elsewhere cannot reach out of its folder: paths that lead out, and providers that are a command, a host
+    or a model, count only if they are given again. This user's own jobs may, but for commands.
+
+    Parameters
+    ----------
+    given
+        Fields as the user gives them again, in place of the job's.
+    allow_command
+        The user knows the command that the job names, and wants it run.
+
     Raises
     ------
     BadInput
-        If the folder holds no job, or one of another version.
+        If the folder holds no job, one that is damaged or of another version, or one that reaches out.
     """
+    path, given = folder / "job.json", given or {}
     try:
-        document = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+        text = require_file(path).read_bytes()
     except OSError:
         raise BadInput(f"job: {folder} holds no job.json; give SCENE, --cameras, --roi and --out") from None
-    except ValueError as error:
-        raise BadInput(f"job: {folder / 'job.json'} is damaged ({error}); prepare the job again") from None
-    known = {f.name for f in fields(RemovalJob)}
-    if not isinstance(document, dict) or document.pop("version", None) != JOB_VERSION or set(document) - known:
-        raise BadInput(f"job: {folder / 'job.json'} was made by another version; prepare the job again")
     try:
-        return RemovalJob(**document).resolved(folder)
-    except TypeError as error:
-        raise BadInput(f"job: {folder / 'job.json'} is incomplete ({error})") from None
+        document: dict[str, Any] = checked(dict[str, Any], parse_json(text, str(path), LARGEST_JOB), str(path))
+    except BadInput as error:
+        raise BadInput(f"job: {error}; it is damaged, prepare the job again") from None
+    document.pop("mark", None)
+    if document.pop("version", None) != JOB_VERSION or set(document) - set(kinds(RemovalJob)):
+        raise BadInput(f"job: {path} was made by another version; prepare the job again")
+    stored: RemovalJob = checked(RemovalJob, document, f"job: {path}", SETTING)
+    _refuse_reaching_out(stored, folder, given, _record(text).exists())
+    job = stored.resolved(folder)
+    for _, value in _named_providers(job, given):
+        if value.startswith(COMMAND) and not allow_command:
+            raise BadInput(
+                f"job: {path} wants to run {value.removeprefix(COMMAND)!r}; if you know this command and "
+                "want it run, add --allow-command"
+            )
+    return replace(job, **given)
 
 
-def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Let `write(file)` fill a temporary file beside `path`, then move it there; nothing half-written stays.
+def _refuse_reaching_out(job: RemovalJob, folder: Path, given: Mapping[str, Any], own: bool) -> None:
+    """Raise BadInput if a job names what it did not bring, and neither did the user, nor wrote it so themselves."""
+    path, root = folder / "job.json", folder.resolve()
+    written = {"stages", "summary.json", *(getattr(job, n) for n in WRITTEN if n not in given)}
+    for link in _links_out(folder, root):
+        place = link.relative_to(folder)
+        if not own or any(place.is_relative_to(w) for w in written if w):
+            raise BadInput(f"job: {link} is a link that leads out of the folder; take it away")
+    if own:
+        return
+    stranger = f"job: {path} was not written by you on this machine, and"
+    for name in job.PATHS:
+        value, option = getattr(job, name), "SCENE" if name == "scene" else f"--{name.replace('_', '-')}"
+        if name not in given and value not in (None, "none") and not _lies_in(root, folder / value):
+            raise BadInput(f"{stranger} {option} leads out of its folder, to {value}; give {option} if you want that")
+    for name, value in _named_providers(job, given):
+        option = f"--{name.replace('_', '-')}"
+        if ":" in value and not value.startswith(COMMAND):
+            raise BadInput(f"{stranger} names {option} {value}; give {option} if you want that")
 
-    Raises
-    ------
-    BadInput
-        If the folder cannot be written or the disk is full.
-    """
+
+def _named_providers(job: RemovalJob, given: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Those that the job names itself, as options or as settings, rather than the user."""
+    for name in PROVIDERS:
+        if name not in given:
+            yield name, getattr(job, name) or ""
+        if "set" not in given:
+            yield name, job.set.get(name, "")
+
+
+def _links_out(folder: Path, root: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(folder):  # links are not followed
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if path.is_symlink() and not _lies_in(root, path):
+                yield path
+
+
+def _lies_in(root: Path, path: Path) -> bool:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(name, 0o666 & ~_umask())
-            os.replace(name, path)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(name)
-            raise
-    except OSError as error:
-        raise BadInput(f"cannot write {path} ({error.strerror})") from None
+        return path.resolve().is_relative_to(root)
+    except (OSError, RuntimeError, ValueError):  # a loop of links, a name that no file can have
+        return False
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _record(text: bytes) -> Path:
+    """The mark that this user wrote this job.json on this machine."""
+    return user_state_folder() / "jobs" / hashlib.sha256(text).hexdigest()
+
+
+def _remember(record: Path) -> None:
+    """Keep the mark; where there is no place for it, the job counts as a stranger's."""
+    with suppress(OSError):
+        record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        record.touch()
+        oldest = sorted(record.parent.iterdir(), key=lambda p: p.stat().st_mtime)
+        for stale in oldest[:-MOST_RECORDS]:
+            stale.unlink()

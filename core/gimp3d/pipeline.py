@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from .priors.inpaint import Appearance, check_provider, inpaint_reference, paint
 from .priors.monodepth import check_depth_prior, depth_prior, looks
 from .progress import Progress, silent
 from .raster import RasterSettings, Window, drawing, footprint, render, surface_depth, touched_window
+from .schema import Seed, Share
 from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_number, draw_charts, find_planes
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
@@ -96,11 +97,11 @@ class RemovalSettings:
     refine: RefineSettings = RefineSettings()
     inpaint: str = "exemplar"
     depth_prior: str = "auto"
-    shadow: str = "auto"  # auto | off | mask: what the object's own shadow is taken for
+    shadow: Literal["auto", "off", "mask"] = "auto"  # auto | off | mask: what the object's own shadow is taken for
     use_evidence: bool = True  # copy what photos show of the hidden surface before inventing the rest
     extra_references: int = 3  # views completed after the first one, where it does not reach
-    extra_gain: float = 0.01  # share of the hole that an extra reference must still find open
-    random_seed: int = 0
+    extra_gain: Share = 0.01  # share of the hole that an extra reference must still find open
+    random_seed: Seed = 0
     refine_views: str = ""  # who is asked to refine painted views beside their reference; empty: nobody
     painter_seconds: float = 600.0  # that a painter or model outside this program may take for one picture
     prompt: str = ""  # what stands behind the object, for painters that read
@@ -1064,7 +1065,7 @@ def _complete_depth(
             ).image
     call = run.call("--depth-prior", stage, settings)
     prior = depth_prior(spec, view.camera.height, view.camera.width, picture, call)
-    surface = spec if spec in ("harmonic", "planar") else settings.depth.surface
+    surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     known = rim(view, settings.masks.solid)
     return complete_depth(
         view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)

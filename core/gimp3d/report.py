@@ -12,10 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from .files import write_atomically
 from .gaussians import Gaussians
 from .io.cameras import write_transforms
 from .io.images import write_png
-from .job import write_atomically
 from .pipeline import Picture, RemovalResult, View, render_bytes
 from .stages.charts import Chart
 from .stages.propagate import Rule

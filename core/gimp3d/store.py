@@ -2,49 +2,62 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import zipfile
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .job import write_atomically
+from .files import write_atomically
 
 
 class StageStore:
     """Keeps each stage's result in `folder` under the key of the whole job's inputs.
 
-    A result of another key (other scene, cameras, settings or program version) is ignored and overwritten.
+    A result of another key (other scene, cameras or program version) or of other settings is ignored and overwritten,
+    and so is a file that is damaged or no stage's at all: each carries a checksum.
     """
 
-    def __init__(self, folder: Path, key: str, kinds: tuple[type, ...], resume: bool) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        key: str,
+        kinds: tuple[type, ...],
+        resume: bool,
+        settings: Mapping[str, Any] | None = None,  # of the whole removal, as plain values
+    ) -> None:
         self.folder, self.key, self.resume = folder, key, resume
+        self.settings = json.loads(json.dumps(settings or {}))  # tuples as they come back
         self.kinds = {kind.__name__: kind for kind in kinds}
 
     def load(self, name: str) -> Any | None:
         """The stage's stored result, or None if there is none of this key, it is damaged or no longer understood."""
         path = self._path(name)
-        if not self.resume or not path.exists():
+        if not self.resume or not path.is_file():
             return None
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {k: file[k] for k in file.files}
             document = json.loads(bytes(arrays.pop("document")).decode())
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-            return None  # a crash in the middle of an older version's write; the stage simply runs again
-        if document["key"] != self.key:
-            return None
-        try:
+            if document["key"] != self.key or document["settings"] != self.settings:
+                return None
+            if document["checksum"] != _checksum(document["result"], arrays):
+                return None
             return self._decode(document["result"], arrays)
-        except (KeyError, TypeError):
-            return None  # stored before a kind of result got other fields
+        except (
+            Exception
+        ):  # empty, damaged, somebody else's, of an older version: whatever is wrong, the stage runs again
+            return None
 
     def save(self, name: str, result: Any) -> None:
         """Store a result made of dataclasses, tuples, arrays, strings, numbers and None."""
         arrays: dict[str, np.ndarray] = {}
-        document = {"key": self.key, "result": self._encode(result, arrays)}
+        encoded = self._encode(result, arrays)
+        document = {"key": self.key, "settings": self.settings, "result": encoded}
+        document["checksum"] = _checksum(encoded, arrays)
         arrays["document"] = np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
         write_atomically(self._path(name), lambda f: np.savez(f, **arrays))  # type: ignore[arg-type]
 
@@ -80,3 +93,11 @@ class StageStore:
             return Path(value["path"])
         members = {k: self._decode(v, arrays) for k, v in value["fields"].items()}
         return self.kinds[value["kind"]](**members)
+
+
+def _checksum(encoded: Any, arrays: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(encoded, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -84,3 +84,18 @@ def test_malformed_regions_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "roi.json").write_text(text)
     with pytest.raises(BadInput, match="ROI"):
         read_region(tmp_path / "roi.json")
+
+
+def test_more_boxes_than_time_allows_are_refused(tmp_path: Path) -> None:
+    """Each takes a third of a second and more."""
+    box = {"center": [0, 0, 0], "size": [1, 1, 1]}
+    (tmp_path / "roi.json").write_text(json.dumps([box] * 300))
+    with pytest.raises(BadInput, match="300 boxes; 50 are the most"):
+        read_region(tmp_path / "roi.json")
+
+
+@pytest.mark.parametrize("wrong", [10**400, 1e200, True, "1", None, [1], float("nan")])
+def test_numbers_that_no_box_can_have_are_refused(wrong: object, tmp_path: Path) -> None:
+    (tmp_path / "roi.json").write_text(json.dumps({"center": [0, 0, wrong], "size": [1, 1, 1]}))
+    with pytest.raises(BadInput, match="ROI"):
+        read_region(tmp_path / "roi.json")

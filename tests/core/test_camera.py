@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
@@ -57,3 +61,13 @@ def test_quaternions_and_matrices_invert_each_other(quat) -> None:
     matrix = quats_to_matrices(np.array([quat]))
     np.testing.assert_allclose(matrix[0] @ matrix[0].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(quats_to_matrices(matrices_to_quats(matrix)), matrix, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"width": 0}, {"height": -1}, {"viewmat": np.full((4, 4), np.nan)}, {"viewmat": np.eye(3)}, {"fx": np.inf}],
+)
+def test_a_camera_that_no_picture_can_have_is_refused(wrong: dict[str, Any]) -> None:
+    good = Camera("a", 4, 3, 5.0, 5.0, 2.0, 1.5, np.eye(4))
+    with pytest.raises(ValueError, match="camera a: "):
+        replace(good, **wrong)

@@ -89,4 +89,6 @@ def test_the_fit_of_a_prior_is_drawn_with_its_line(slope: float, tilt: float) ->
 
 
 def test_a_fit_of_a_constant_prior_is_drawn() -> None:
-    draw(Picture("fit", "", IMAGE, (np.full((40, 2), 3.0), np.zeros(2), np.array([0.0]))))
+    drawn = draw(Picture("fit", "", IMAGE, (np.full((40, 2), 3.0), np.zeros(2), np.array([0.0]))))
+    rows, cols = np.nonzero((drawn == (94, 85, 163)).all(-1))
+    assert len(rows) and np.ptp(rows) < 20 and np.ptp(cols) < 20  # all pairs are one dot

@@ -25,6 +25,7 @@ import pytest
 from plyfile import PlyData
 from scenes import REGION, block, cameras, discs, scene, truth
 
+from gimp3d import pipeline
 from gimp3d.box import Box, Region
 from gimp3d.camera import Camera, Distortion
 from gimp3d.cli import Reporter, main
@@ -289,6 +290,7 @@ def test_nothing_to_do_is_a_no_op_with_a_warning(case: str, remove: Remove) -> N
         assert (done.folder / "out.ply").read_bytes() == (done.folder / "scene.ply").read_bytes()
         assert "nothing to remove" in done.errors[0]
         return
+    assert case == "T empty"
     above = block()
     above.means[:, 2] += 1.0  # every view sees past it what another hides
     done = remove(truth().extended(above), cameras(12), (Box.make([0, 0, 1.26], [0.62, 0.62, 0.56]),))
@@ -311,6 +313,7 @@ def test_what_cannot_be_done_is_refused_with_the_reason(case: str, remove: Remov
     elif case == "ROI behind every camera":
         assert_refused(remove(views=[turned_away(c) for c in cameras()]), "no usable view")
     else:
+        assert case == "no usable view"
         inside = [camera_at(f"inside{k}", (0.1 * k, 0, 0.3), (1, 1, 0)) for k in range(3)]
         assert_refused(remove(views=inside), "3 are inside the ROI")
 
@@ -340,6 +343,7 @@ def test_holes_without_a_whole_rim(case: str, remove: Remove) -> None:
         region = (*REGION, Box.make([3, 0, 0.26], [0.62, 0.62, 0.56]))
         assert_filled(remove(scene().extended(far), region=region), truth())
     else:
+        assert case == "islands"
         whole, boxes = floor_with_a_frame()
         views = cameras(9, 240, 180)
         parts = [
@@ -386,6 +390,7 @@ def test_the_smallest_holes_and_pictures(case: str, remove: Remove) -> None:
     elif case == "an image of 12×9 pixels":
         assert_legal(remove(views=[c.scaled(0.1) for c in cameras()]))
     else:
+        assert case == "a patch larger than the image"
         image = np.random.default_rng(0).integers(0, 255, (4, 5, 3), dtype=np.uint8)
         hole = np.zeros((4, 5), bool)
         hole[1, 2] = True
@@ -405,6 +410,7 @@ def test_a_constant_texture_is_continued_the_same_way_every_time(case: str, remo
         assert len(colours) and np.abs(colours - (0.5 + SH_C0 * 0.1)).max() < 2 / 255
         assert (runs[0].folder / "out.ply").read_bytes() == (runs[1].folder / "out.ply").read_bytes()
         return
+    assert case == "ties"
     hole = np.zeros((40, 50), bool)
     hole[12:26, 15:33] = True
     image = np.full((40, 50, 3), 90, np.uint8)
@@ -469,6 +475,7 @@ def test_the_far_and_the_void_are_no_surface(case: str, remove: Remove) -> None:
     if case == "the floor ends beside the object":
         whole, true = (g.take(g.means[:, 0] > -0.4) for g in (scene(), truth()))
     else:
+        assert case == "a sky of splats"
         rng = np.random.default_rng(0)
         directions = rng.normal(size=(3000, 3))
         points = 60 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -491,6 +498,7 @@ def test_what_stands_before_the_hole_stays_alone(case: str, remove: Remove) -> N
         for view in find_masks(whole, REGION, views).views:
             assert not (view.target & on_rod[view.camera.id]).any(), view.camera.id
         return
+    assert case == "nor painted elsewhere"
     result = remove(whole, views).after.gaussians
     for camera in views:
         error = np.abs(render_bytes(result, camera).astype(float) - render_bytes(true, camera)).max(-1)
@@ -504,6 +512,7 @@ def test_cameras_in_and_at_the_region(case: str, remove: Remove) -> None:
         assert any(w.startswith("1 views do not frame the region or lie inside it") for w in done.summary["warnings"])
         assert done.summary["counts"]["views"] == 9
     else:
+        assert case == "ROI partly behind the camera"
         beside = camera_at("beside", (0.45, 0, 0.4), (0.45, 0.9, 0.1), 60)
         corners = beside.to_camera(REGION[0].corners())[:, 2]
         assert corners.min() < 0 < corners.max()
@@ -535,6 +544,7 @@ def test_a_reference_that_does_not_see_the_hole_is_rejected(case: str, remove: R
     if case == "behind an occluder":
         assert_refused(remove(blocked, options=("--reference", best)), f"{best} does not see")
         return
+    assert case == "chosen behind an occluder"
     done = remove(blocked, options=("--depth-prior", "planar"))  # a depth of its own needs a photo as reference
     assert not done.stage("reference")["reason"].startswith(best)
     assert_filled(done, truth().extended(wall_before(camera)))
@@ -681,6 +691,7 @@ def test_shadows_can_be_named_and_go(case: str, remove: Remove) -> None:
         # a dark place that the block does not cast: said not to be its shadow, and left as it is
         assert "no shadow found" in remove(with_shadow()).words
     else:
+        assert case == "an extra ROI"
         done = remove(with_shadow(), region=(*REGION, Box.make([0.5, 0, 0], [0.46, 0.46, 0.1])))
         left = remove(with_shadow(), folder="without")
         assert_legal(done)
@@ -707,6 +718,8 @@ def assert_as_before(folder: Path) -> None:
 
 @row(BREAKDOWN, "disk full", *(f"cancel, {stage}" for stage in STAGES))
 def test_files_are_as_before_a_run_that_stops(case: str, remove: Remove, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert case == "disk full" or case.removeprefix("cancel, ") in STAGES
+
     def interrupt(reporter: Reporter, stage: str, *_: object) -> None:
         if stage == case.removeprefix("cancel, "):
             raise KeyboardInterrupt
@@ -735,7 +748,10 @@ def in_a_child(folder: Path, first: str, options: Sequence[object] = ()) -> subp
 
 
 @row(BREAKDOWN, "crash")
-def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove) -> None:
+def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove, monkeypatch: pytest.MonkeyPatch) -> None:
+    def again(*_: object) -> None:
+        raise AssertionError("a finished stage ran again")
+
     undisturbed = remove(change=old_result)
     folder = undisturbed.folder
     expected = (folder / "out.ply").read_bytes()
@@ -745,9 +761,9 @@ def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove) -> None:
     crash = "import os, gimp3d.pipeline as p; p.mapping_field = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
+    monkeypatch.setattr(pipeline, "find_masks", again)
     assert main([str(a) for a in command(folder, ("--job", job, "--resume"))]) == 0
     assert (folder / "out.ply").read_bytes() == expected
-    assert undisturbed.stage("masks")["seconds"] < 0.05  # taken from the job folder
 
 
 @row(BREAKDOWN, "out of memory")
@@ -756,7 +772,7 @@ def test_views_that_no_memory_holds_are_refused(case: str, remove: Remove) -> No
     folder = remove(change=old_result).folder
     (folder / "summary.json").unlink()
     old_result(folder)
-    write_transforms(folder / "cameras.json", [c.scaled(300) for c in cameras()])
+    write_transforms(folder / "cameras.json", [c.scaled(80) for c in cameras()])
     limit = "import resource as r; r.setrlimit(r.RLIMIT_AS, (2 << 30, 2 << 30))"
     done = in_a_child(folder, limit)
     assert done.returncode == 3 and done.stderr.startswith("gimp3d: error: out of memory")
@@ -772,6 +788,7 @@ def test_a_second_run_and_overlapping_boxes(case: str, remove: Remove) -> None:
         both = remove(region=halves, folder="halves")
         assert_filled(both, truth())
         return
+    assert case == "run again"
 
     def take_result(folder: Path) -> None:
         shutil.copy2(once.folder / "out.ply", folder / "scene.ply")

@@ -64,15 +64,15 @@ def photographed(wrong: dict[str, np.ndarray]) -> RemovalResult:
 
 
 PICTURES = {c.id: PHOTOS[c.id] for c in OTHERS}
-# What is wrong, and by how many dB the result may be worse than without. Each is 0.5 to 3.7 dB above what was measured.
+# What is wrong, and by how many dB the result may be worse than without. Each is 0.5 to 1.4 dB above what was measured.
 # Fewer views are not worse here: they leave more of the hole to the reference, whose picture is the true one. Losses
-# are against 36.4 dB; when that was 34.5 they were 1, 1 and 18 where they are 2.5, 2.5 and 19.5 now.
+# are against 36.4 dB; an open hole has 10.4. Surfaces that are off by a tenth cost most of that: 7 dB are left.
 CASES: dict[str, tuple[Callable[[], RemovalResult], Callable[[], AbstractContextManager[None]], float]] = {
     "one view": (lambda: removed((REFERENCE,)), nullcontext, 1),
     "two views 1° apart": (lambda: near(1.0, OTHERS[:1]), nullcontext, 1),
     "all views within 10°": (lambda: near(10.0), nullcontext, 2.5),
     "exposures off by 20 %": (lambda: photographed(exposed(PICTURES, 0.2, 0)), nullcontext, 0.5),
-    "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 8),
+    "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 3),
     "a tenth of all pixels wrong": (lambda: photographed(garbled(PICTURES, 0.1, 0)), nullcontext, 2.5),
     "surface off by 1 %": (removed, partial(noisy_surfaces, 0.01, 0), 3),
     "surface off by 10 %": (removed, partial(noisy_surfaces, 0.1, 0), 19.5),

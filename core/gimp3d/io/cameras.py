@@ -10,17 +10,24 @@ import math
 import re
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..camera import Camera, Distortion
+from ..camera import Camera, Distortion, output_name
 from ..errors import BadInput
+from ..files import require_file, write_atomically
 from ..gaussians import quats_to_matrices
-from ..job import write_atomically
+from ..schema import Between, checked, read_json, shown
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
+LARGEST_SIDE, LARGEST_PICTURE = (1 << 16) - 1, 1 << 27  # pixels
+NARROWEST, WIDEST = 1e4, 1e-3  # focal lengths over the picture's width: views of a hundredth and of 179.9 degrees
+LONGEST_NAME = 200  # bytes of each part of an ID: file systems allow 255, and our own endings come behind it
+LONGEST_ID = 1000
+LensAngle = Annotated[float, Between(1e-4, math.pi - 1e-4)]  # radians
 EXACT = "world_to_camera"  # our own key of a frame; counts only where transform_matrix says the same
 REFUSED = {
     "fisheye": {
@@ -75,7 +82,7 @@ def read_cameras(
     if path.is_dir():
         cameras = _read_colmap(path, images)
     else:
-        document = _read_json(path)
+        document = read_json(path, "cameras")
         if isinstance(document, dict) and isinstance(document.get("frames"), list):
             cameras = _read_transforms(path, document, images)
         elif isinstance(document, list) and document and isinstance(document[0], dict) and "rotation" in document[0]:
@@ -84,10 +91,13 @@ def read_cameras(
             raise BadInput(f"{path} holds no cameras: a transforms.json, cameras.json or COLMAP folder expected")
     if not cameras:
         raise BadInput(f"{path} holds no camera")
-    names = [c.id for c in cameras]
-    if len(set(names)) < len(names):
-        twice = next(n for n in names if names.count(n) > 1)
-        raise BadInput(f"{path}: two cameras have the ID {twice}")
+    names: dict[str, str] = {}
+    for c in cameras:
+        name = output_name(c.id)
+        if name in names:
+            both = f"IDs, {names[name]} and {c.id}, whose pictures would have one name"
+            raise BadInput(f"{path}: two cameras have {f'the ID {c.id}' if names[name] == c.id else both}")
+        names[name] = c.id
     return cameras
 
 
@@ -123,12 +133,17 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
 
 
 def camera_id(name: Any, where: str) -> str:
-    """A camera's name as a safe relative path: `./` dropped, `..` and absolute paths refused."""
+    """A camera's name as a safe relative path: `./` dropped; what leads out or no file can be called is refused."""
     if not isinstance(name, str) or not name.strip():
         raise BadInput(f"{where}: a camera has no name")
     parts = [p for p in name.replace("\\", "/").split("/") if p != "."]
-    if ".." in parts or name.startswith("/") or re.match(r"^[A-Za-z]:", name) or "\0" in name:
-        raise BadInput(f"{where}: the camera name {name!r} leads out of the output folder")
+    if ".." in parts or name.startswith(("/", "\\")) or re.match(r"^[A-Za-z]:", name):
+        raise BadInput(f"{where}: the camera name {shown(name)} leads out of the output folder")
+    checked(str, name, f"{where}: the camera's name")
+    if not all(p.strip() for p in parts) or any(ord(c) < 32 or ord(c) == 127 for c in name):
+        raise BadInput(f"{where}: no file can have the camera's name {shown(name)}")
+    if len(name.encode()) > LONGEST_ID or any(len(p.encode()) > LONGEST_NAME for p in parts):
+        raise BadInput(f"{where}: the camera name {shown(name)} is longer than a file's can be")
     return "/".join(parts)
 
 
@@ -145,13 +160,16 @@ def rigid(
     """
     try:
         m = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         m = np.zeros(0)
     if m.shape == (3, 4):
         m = np.vstack([m, [0, 0, 0, 1]])
     if m.shape != (4, 4) or not np.isfinite(m).all():
         raise BadInput(f"{where}: the pose is not a finite 4×4 matrix")
-    s = np.linalg.svd(m[:3, :3], compute_uv=False)
+    largest = float(np.abs(m[:3, :3]).max())
+    if np.abs(m).max() > 1e150 or largest < 1e-150:
+        raise BadInput(f"{where}: the pose's numbers make no sense")
+    s = np.linalg.svd(m[:3, :3] / largest, compute_uv=False)
     if s[2] < 1e-9 or s[0] / s[2] > 1.001:
         raise BadInput(f"{where}: the pose is sheared or flat; only rotation, translation and uniform scale are poses")
     if np.linalg.det(m[:3, :3]) < 0:
@@ -200,10 +218,14 @@ def make_camera(
         fx, fy, cx, cy = (float(v) for v in intrinsics)
     except (TypeError, ValueError, OverflowError):
         raise BadInput(f"{where}: numbers expected for size, focal length and principal point") from None
-    if not 0 < width < 1 << 16 or not 0 < height < 1 << 16:
-        raise BadInput(f"{where}: an image of {width}×{height} pixels makes no sense")
+    if not 0 < width <= LARGEST_SIDE or not 0 < height <= LARGEST_SIDE or width * height > LARGEST_PICTURE:
+        raise BadInput(f"{where}: an image of {shown(width)}×{shown(height)} pixels makes no sense")
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
         raise BadInput(f"{where}: focal lengths must be positive, got {fx} and {fy}")
+    if not all(WIDEST * width <= f <= NARROWEST * width for f in (fx, fy)) or max(abs(cx), abs(cy)) > NARROWEST * width:
+        raise BadInput(
+            f"{where}: no lens has focal lengths {fx:g} and {fy:g} and centre {cx:g}, {cy:g} ({width} px wide)"
+        )
     if distortion is not None:
         if not np.isfinite(distortion.coefficients).all():
             raise BadInput(f"{where}: the distortion coefficients are not finite")
@@ -219,37 +241,54 @@ def refuse_model(model: str, where: str) -> None:
             raise BadInput(f"{where}: {kind} cameras ({model}) are not supported; undistort the photos to a pinhole")
 
 
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadInput(f"cameras: cannot read {path} ({error.strerror})") from None
-    except ValueError as error:
-        raise BadInput(f"cameras: {path} is not JSON ({error})") from None
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of a transforms.json, with what the document says of all of them."""
+
+    file_path: Any = None
+    transform_matrix: list[list[float]] | None = None
+    world_to_camera: Any = None  # EXACT
+    w: int | None = None
+    h: int | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    camera_angle_x: Any = None  # checked where it is used
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    camera_model: str = "OPENCV"
+    is_fisheye: bool = False
+    split: Literal["train", "test"] = "train"
 
 
 def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) -> tuple[Camera, ...]:
     cameras = []
-    for k, frame in enumerate(document["frames"]):
+    of_all = {key: v for key, v in document.items() if key != "frames"}
+    for k, entry in enumerate(document["frames"]):
         where = f"{path}, frame {k}"
-        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+        if not isinstance(entry, dict) or entry.get("transform_matrix") is None:
             raise BadInput(f"{where}: no transform_matrix")
-        both = {**{key: v for key, v in document.items() if key != "frames"}, **frame}
-        name = camera_id(frame.get("file_path"), where)
-        refuse_model(str(both.get("camera_model", "OPENCV")), where)
-        if both.get("is_fisheye"):
+        frame: _Frame = checked(_Frame, {**of_all, **entry}, where, extra=True)
+        name = camera_id(frame.file_path, where)
+        refuse_model(frame.camera_model, where)
+        if frame.is_fisheye:
             refuse_model("FISHEYE", where)
         photo = _photo(images or path.parent, name)
-        width, height, intrinsics = _transforms_intrinsics(both, photo, where)
-        extra = [k for k in ("k4", "k5", "k6") if both.get(k)]
+        width, height, intrinsics = _transforms_intrinsics(frame, photo, where)
+        extra = [k for k in ("k4", "k5", "k6") if getattr(frame, k)]
         if extra:
             raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        viewmat = _exactly(_inverted(rigid(frame["transform_matrix"], where) @ OPENGL_TO_OPENCV), frame.get(EXACT))
-        distortion = _distortion([both.get(c, 0.0) for c in ("k1", "k2", "p1", "p2", "k3")], where)
-        split = both.get("split", "train")
-        if split not in ("train", "test"):
-            raise BadInput(f"{where}: split must be train or test, got {split!r}")
-        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, split, photo))
+        pose = rigid(frame.transform_matrix, where)
+        viewmat = _exactly(_inverted(pose @ OPENGL_TO_OPENCV), frame.world_to_camera)
+        distortion = Distortion(frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
+        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, frame.split, photo))
     return tuple(cameras)
 
 
@@ -257,23 +296,28 @@ def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
     """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
     try:
         exact = np.array(told, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         return viewmat
     same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
     return exact if same else viewmat
 
 
-def _transforms_intrinsics(both: dict[str, Any], photo: Path, where: str) -> tuple[Any, Any, tuple[Any, Any, Any, Any]]:
-    width, height = both.get("w"), both.get("h")
+def _transforms_intrinsics(
+    frame: _Frame, photo: Path, where: str
+) -> tuple[int, int, tuple[float, float, float, float]]:
+    width, height, fx = frame.w, frame.h, frame.fl_x
     if width is None or height is None:
         width, height = _image_size(photo, where)
-    fx = both.get("fl_x")
-    if fx is None and "camera_angle_x" in both:
-        fx = 0.5 * float(width) / math.tan(0.5 * float(both["camera_angle_x"]))
+    if fx is None and frame.camera_angle_x is not None:
+        angle = checked(
+            Annotated[float, Between(1e-4, math.pi - 1e-4)], frame.camera_angle_x, f"{where}: camera_angle_x"
+        )
+        fx = 0.5 * width / math.tan(0.5 * angle)
     if fx is None:
         raise BadInput(f"{where}: no focal length (fl_x or camera_angle_x)")
-    fy = both.get("fl_y", fx)
-    return width, height, (fx, fy, both.get("cx", float(width) / 2), both.get("cy", float(height) / 2))
+    fy = fx if frame.fl_y is None else frame.fl_y
+    cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
+    return width, height, (fx, fy, cx, cy)
 
 
 def _image_size(photo: Path, where: str) -> tuple[int, int]:
@@ -303,27 +347,34 @@ def _distortion(coefficients: Sequence[Any], where: str) -> Distortion:
         raise BadInput(f"{where}: the distortion coefficients are not numbers") from None
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """A camera of Inria's cameras.json."""
+
+    img_name: Any
+    rotation: list[list[float]]
+    position: list[float]
+    fx: float
+    fy: float
+    width: int
+    height: int
+
+
 def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[Camera, ...]:
     cameras = []
-    for k, entry in enumerate(document):
+    for k, given in enumerate(document):
         where = f"{path}, camera {k}"
-        missing = [n for n in ("img_name", "rotation", "position", "fx", "fy", "width", "height") if n not in entry]
-        if missing:
-            raise BadInput(f"{where}: no {', '.join(missing)}")
+        entry: _Entry = checked(_Entry, given, where, extra=True)
         try:
             pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = np.array(entry["rotation"], float), np.array(entry["position"], float)
-        except (TypeError, ValueError):
+            pose[:3, :3], pose[:3, 3] = np.array(entry.rotation, float), np.array(entry.position, float)
+        except (TypeError, ValueError, OverflowError, RecursionError):
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers") from None
-        name = camera_id(entry["img_name"], where)
-        size = (entry["width"], entry["height"])
+        name = camera_id(entry.img_name, where)
         viewmat = _inverted(rigid(pose, where))
-        try:
-            centre = (float(size[0]) / 2, float(size[1]) / 2)
-        except (TypeError, ValueError):
-            raise BadInput(f"{where}: width and height must be numbers") from None
-        intrinsics = (entry["fx"], entry["fy"], *centre)
+        intrinsics = (entry.fx, entry.fy, entry.width / 2, entry.height / 2)
         photo = _photo(images or path.parent, name)
+        size = (entry.width, entry.height)
         cameras.append(make_camera(where, name, viewmat, size, intrinsics, None, "train", photo))
     return tuple(cameras)
 
@@ -338,7 +389,7 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
         poses = _colmap_images_bin(model) if binary else _colmap_images_txt(model)
     except OSError as error:
         raise BadInput(f"cannot read the COLMAP model in {model} ({error.strerror})") from None
-    except (struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError) as error:
+    except (struct.error, ValueError, IndexError, KeyError, OverflowError) as error:
         raise BadInput(f"the COLMAP model in {model} is damaged ({error})") from None
     if images is None:
         images = next(
@@ -346,7 +397,8 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             folder,
         )
     cameras = []
-    for name, lens, quat, translation in poses:
+    for number, (given, lens, quat, translation) in enumerate(poses):
+        name = camera_id(given, f"{model}, image {number}")
         where = f"{model}, image {name}"
         if lens not in lenses:
             raise BadInput(f"{where}: its camera {lens} is not in the model")
@@ -357,7 +409,7 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             raise BadInput(f"{where}: the pose is not finite")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quats_to_matrices(np.array([quat]))[0], translation
-        photo = images / camera_id(name, where)
+        photo = images / name
         cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, "train", photo))
     return tuple(sorted(cameras, key=lambda c: c.id))
 
@@ -387,7 +439,11 @@ def _colmap_intrinsics(
 
 
 def _data_lines(path: Path) -> list[str]:
-    return [line.rstrip("\r") for line in path.read_text(encoding="utf-8").split("\n") if not line.startswith("#")]
+    return [
+        line.rstrip("\r")
+        for line in require_file(path).read_text(encoding="utf-8").split("\n")
+        if not line.startswith("#")
+    ]
 
 
 def _colmap_cameras_txt(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
@@ -408,7 +464,7 @@ def _colmap_images_txt(model: Path) -> list[tuple[str, int, list[float], list[fl
 
 
 def _colmap_cameras_bin(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
-    data = (model / "cameras.bin").read_bytes()
+    data = require_file(model / "cameras.bin").read_bytes()
     (count,), at, found = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):
         number, kind, width, height = struct.unpack_from("<iiQQ", data, at)
@@ -421,7 +477,7 @@ def _colmap_cameras_bin(model: Path) -> dict[int, tuple[str, int, int, list[floa
 
 
 def _colmap_images_bin(model: Path) -> list[tuple[str, int, list[float], list[float]]]:
-    data = (model / "images.bin").read_bytes()
+    data = require_file(model / "images.bin").read_bytes()
     (count,), at, poses = struct.unpack_from("<Q", data), 8, []
     for _ in range(count):
         pose = struct.unpack_from("<7d", data, at + 4)

@@ -6,8 +6,6 @@ content, so a wrong suffix does no harm.
 
 from __future__ import annotations
 
-import gzip
-import json
 import struct
 import zipfile
 import zlib
@@ -18,13 +16,20 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadInput
+from ..files import require_file
 from ..gaussians import SH_C0, Gaussians
+from ..memory import GAUSSIAN, require_memory
+from ..schema import checked, parse_json
 from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 SPZ_MAGIC = b"NGSP"
 SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
-LARGEST_SPZ = 1 << 34  # bytes unpacked; more is a damaged header
+DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
+SPZ_HEADER = 16  # bytes
+LARGEST_META = 16 << 20  # bytes of a SOG's meta.json; codebooks have 256 entries
+LARGEST_PACKED = 1 << 31  # bytes of a SOG's picture
+LARGEST_PALETTE = 1 << 24  # pixels of a SOG's SH palette
 CHUNK_ROWS = 256  # Gaussians that share a chunk's bounds in a compressed PLY
 SQRT_HALF = np.sqrt(0.5)
 # Signs of SH coefficients 1 … 15 under a half turn about x: spz has y up and z back, Inria's files y down and z ahead
@@ -43,7 +48,7 @@ def read_scene(path: Path | str) -> SplatFile:
     try:
         if path.is_dir() or path.name == "meta.json":
             return file_of(_from_sog(_folder_reader(path if path.is_dir() else path.parent), path))
-        with path.open("rb") as f:
+        with require_file(path).open("rb") as f:
             start = f.read(4)
         if start[:3] == b"ply":
             return file_of(_from_compressed_ply(path)) if _is_compressed(path) else read_ply(path)
@@ -51,12 +56,12 @@ def read_scene(path: Path | str) -> SplatFile:
             return file_of(_from_spz(path))
         if start == b"PK\x03\x04":
             with zipfile.ZipFile(path) as archive:
-                return file_of(_from_sog(archive.read, path))
+                return file_of(_from_sog(_archive_reader(archive), path))
         if path.suffix.lower() == ".splat":
             return file_of(_from_splat(path))
     except OSError as error:
         raise BadInput(f"cannot read {path} ({error.strerror or error})") from None
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except DAMAGE as error:
         raise BadInput(f"{path} is damaged ({error})") from None
     raise BadInput(f"{path} is not a PLY, nor a .splat, .spz or .sog scene")
 
@@ -125,13 +130,18 @@ def _from_compressed_ply(path: Path) -> Gaussians:
 def _from_spz(path: Path) -> Gaussians:
     """Niantic's .spz, versions 1 to 4 (4: zstd streams instead of one gzip)."""
     data = path.read_bytes()
-    body = _unpacked_spz_4(data, path) if data[:4] == SPZ_MAGIC else gzip.decompress(data)
-    if len(body) < 16 or body[:4] != SPZ_MAGIC:
+    packed = data[:4] != SPZ_MAGIC
+    body = _inflated(data, SPZ_HEADER) if packed else data[:SPZ_HEADER]
+    if len(body) < SPZ_HEADER or body[:4] != SPZ_MAGIC:
         raise BadInput(f"{path} is a gzip file, but no .spz scene")
     version, n, sh_degree, fraction_bits, flags = struct.unpack("<IIBBB", body[4:15])
-    if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS:
+    if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS or (version == 4) == packed or fraction_bits > 24:
         raise BadInput(f"{path}: .spz version {version} with SH degree {sh_degree} is not known")
-    offset = 16
+    row = (6 if version == 1 else 9) + 7 + (4 if version >= 3 else 3) + 3 * SPZ_SH_COUNTS[sh_degree]
+    require_memory(n * (row + GAUSSIAN), f"{path} with {n} Gaussians")
+    size = SPZ_HEADER + n * row  # what its count needs; whatever else is packed there is not unpacked
+    body = _inflated(data, size + 1) if packed else _unpacked_spz_4(data, size, path)
+    offset = SPZ_HEADER
 
     def take(count: int, kind: str = "u1") -> np.ndarray:
         nonlocal offset
@@ -161,8 +171,20 @@ def _from_spz(path: Path) -> Gaussians:
     return _gaussians(means * [1, -1, -1], log_scales, turned, opacity, dc, higher, path, bool(flags & 1))
 
 
-def _unpacked_spz_4(data: bytes, path: Path) -> bytes:
-    """The body that the streams of version 4 make up."""
+def _inflated(data: bytes, size: int) -> bytes:
+    """The first bytes of what a gzip file holds, of all its members; if it holds less, its checksums are right."""
+    body = b""
+    while data and len(body) < size:
+        member = zlib.decompressobj(zlib.MAX_WBITS | 16)
+        body += member.decompress(data, size - len(body))
+        if not member.eof and len(body) < size:
+            raise EOFError("it ends too early")
+        data = member.unused_data.lstrip(b"\0")
+    return body
+
+
+def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
+    """The body that the streams of version 4 make up, of so many bytes."""
     try:
         import zstandard
     except ImportError:
@@ -173,17 +195,17 @@ def _unpacked_spz_4(data: bytes, path: Path) -> bytes:
     offset = table + 16 * streams
     if offset > len(data):
         raise BadInput(f"{path} is truncated")
-    body = [data[:16]]
+    body = bytearray(data[:SPZ_HEADER])
     for packed, unpacked in struct.iter_unpack("<QQ", data[table:offset]):
-        if unpacked > LARGEST_SPZ:
-            raise BadInput(f"{path} is damaged: a stream of {unpacked} bytes")
-        try:
-            unpacker = zstandard.ZstdDecompressor()
-            body.append(unpacker.decompress(data[offset : offset + packed], max_output_size=unpacked))
-        except (zstandard.ZstdError, MemoryError) as error:  # a frame may claim any size
+        if len(body) + unpacked > size:
+            raise BadInput(f"{path} is damaged: a stream of {unpacked} bytes is more than its Gaussians need")
+        try:  # as a stream, as a frame's own word for its size may be a lie
+            stream = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data[offset : offset + packed])
+            body += stream.read(unpacked)
+        except (zstandard.ZstdError, MemoryError) as error:
             raise BadInput(f"{path} is damaged ({error})") from None
         offset += packed
-    return b"".join(body)
+    return bytes(body)
 
 
 def _spz_quats(packed: np.ndarray) -> np.ndarray:
@@ -201,23 +223,50 @@ def _spz_quats(packed: np.ndarray) -> np.ndarray:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def _folder_reader(folder: Path) -> Callable[[str], bytes]:
-    return lambda name: (folder / Path(name).name).read_bytes()
+Read = Callable[[str, int], bytes]  # a file of a scene by its name, and no more than so many bytes of it
 
 
-def _from_sog(read: Callable[[str], bytes], path: Path) -> Gaussians:
+def _folder_reader(folder: Path) -> Read:
+    def read(name: str, most: int) -> bytes:
+        with require_file(folder / Path(name).name).open("rb") as file:
+            return file.read(most)
+
+    return read
+
+
+def _archive_reader(archive: zipfile.ZipFile) -> Read:
+    def read(name: str, most: int) -> bytes:
+        with archive.open(name) as file:
+            return file.read(most)
+
+    return read
+
+
+def _from_sog(read: Read, path: Path) -> Gaussians:
     """PlayCanvas SOG, versions 1 and 2: attributes as lossless WebP pictures, described by meta.json."""
     try:
-        meta: dict[str, Any] = json.loads(read("meta.json"))
+        where = f"{path}: meta.json"
+        meta: dict[str, Any] = checked(
+            dict[str, Any], parse_json(read("meta.json", LARGEST_META + 1), where, LARGEST_META), where
+        )
         version = int(meta.get("version", 1))
         n = int(meta["count"] if version >= 2 else meta["means"]["shape"][0])
+        if n < 0:
+            raise ValueError(f"a count of {n}")
+        require_memory(n * GAUSSIAN, f"{path} with {n} Gaussians")
+
+        def picture(part: str, file: int, most: int) -> np.ndarray:
+            return _webp(read(checked(str, meta[part]["files"][file], where), LARGEST_PACKED), path, most)
 
         def pixels(part: str, file: int = 0) -> np.ndarray:
-            return _webp(read(meta[part]["files"][file]), path).reshape(-1, 4)[:n]
+            found = picture(part, file, 4 * n + (1 << 16)).reshape(-1, 4)
+            if len(found) < n:
+                raise ValueError(f"{n} Gaussians in a picture of {len(found)} pixels")
+            return found[:n]
 
         def decoded(part: str, values: np.ndarray) -> np.ndarray:
             if "codebook" in meta[part]:
-                return np.array(meta[part]["codebook"], np.float64)[values]
+                return np.array(checked(list[float], meta[part]["codebook"], where))[values]
             low, high = np.array(meta[part]["mins"], np.float64), np.array(meta[part]["maxs"], np.float64)
             return low + values / 255 * (high - low)
 
@@ -236,28 +285,45 @@ def _from_sog(read: Callable[[str], bytes], path: Path) -> Gaussians:
         quats = _smallest_three(packed[:, :3] / 255, packed[:, 3].astype(int) - 252)
         higher = None
         if "shN" in meta:
-            entries = _webp(read(meta["shN"]["files"][0]), path)
+            entries = picture("shN", 0, LARGEST_PALETTE)
             count = entries.shape[1] // 64
             palette = decoded("shN", entries[..., :3].reshape(-1, count, 3))
             labels = pixels("shN", 1).astype(int)
             higher = palette[labels[:, 0] + 256 * labels[:, 1]]
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
         raise BadInput(f"{path}: meta.json or a picture of the SOG scene is damaged ({error})") from None
     return _gaussians(means, log_scales, quats, opacity, dc, higher, path)
 
 
-def _webp(data: bytes, path: Path) -> np.ndarray:
-    """A picture [H, W, 4] uint8, RGBA."""
+def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
+    """A picture [H, W, 4] uint8, RGBA, of at most so many pixels."""
     try:
         import cv2
     except ImportError:
         raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if picture is None or picture.ndim != 3:
+    if _webp_pixels(data) > most:
+        raise BadInput(f"{path}: a picture of the SOG scene is far larger than its count needs")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:
+        picture = None
+    if picture is None or picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
         raise BadInput(f"{path}: a picture of the SOG scene cannot be read")
     if picture.shape[2] == 3:
         return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
     return cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA)
+
+
+def _webp_pixels(data: bytes) -> int:
+    """How many pixels a WebP's header announces; 0 for other files, of which OpenCV has a limit of its own."""
+    if data[8:12] != b"WEBP" or len(data) < 30:
+        return 0
+    if data[12:16] == b"VP8L":
+        sizes = int.from_bytes(data[21:25], "little")
+        return ((sizes & 0x3FFF) + 1) * ((sizes >> 14 & 0x3FFF) + 1)
+    if data[12:16] == b"VP8X":
+        return (int.from_bytes(data[24:27], "little") + 1) * (int.from_bytes(data[27:30], "little") + 1)
+    return (int.from_bytes(data[26:28], "little") & 0x3FFF) * (int.from_bytes(data[28:30], "little") & 0x3FFF)
 
 
 def _unpack(packed: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> np.ndarray:
@@ -289,14 +355,17 @@ def _gaussians(
 ) -> Gaussians:
     # 0 and 255 stand for what was rounded to them; their logits would be infinite.
     alpha = np.clip(opacity, 0.25 / 255, 1 - 0.25 / 255)
-    sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
-    if sh.shape[1] not in (1, 4, 9, 16):
-        raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
-    return Gaussians(
-        means=np.ascontiguousarray(means, np.float32),
-        log_scales=np.maximum(log_scales, np.log(1e-9)).astype(np.float32),
-        quats=np.ascontiguousarray(quats, np.float32),
-        opacity_logits=np.log(alpha / (1 - alpha)).astype(np.float32),
-        sh=sh.astype(np.float32),
-        antialiased=antialiased,
-    )
+    try:
+        sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
+        if sh.shape[1] not in (1, 4, 9, 16):
+            raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
+        return Gaussians(
+            means=np.ascontiguousarray(means, np.float32),
+            log_scales=np.maximum(log_scales, np.log(1e-30)).astype(np.float32),  # some formats can say 0
+            quats=np.ascontiguousarray(quats, np.float32),
+            opacity_logits=np.log(alpha / (1 - alpha)).astype(np.float32),
+            sh=sh.astype(np.float32),
+            antialiased=antialiased,
+        )
+    except ValueError as error:
+        raise BadInput(f"{path}: its parts do not fit together ({error})") from None

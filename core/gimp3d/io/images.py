@@ -10,8 +10,9 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..job import write_atomically
+from ..files import require_file, write_atomically
 
+SMALLEST = 1 / 16  # of a camera's width: a photo of less is a thumbnail or a mistake
 ASPECT_TOLERANCE = 1.5  # px by which a photo's size may differ from the scaled camera's, from rounding
 
 
@@ -24,7 +25,9 @@ def read_image(path: Path | str) -> np.ndarray:
         If it is missing or not a picture.
     """
     try:
-        data = np.fromfile(path, dtype=np.uint8)  # not cv2.imread: it fails on non-ASCII names on Windows
+        data = np.fromfile(
+            require_file(Path(path)), dtype=np.uint8
+        )  # not cv2.imread: it fails on non-ASCII names on Windows
     except OSError as error:
         raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
     return decode_image(data, str(path))
@@ -90,9 +93,13 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
     photo = read_image(camera.image)
     height, width = photo.shape[:2]
     factor = width / camera.width
+    if factor < SMALLEST:
+        raise BadInput(
+            f"{camera.image} has {width}×{height} pixels, far fewer than its camera's {camera.width}×{camera.height}"
+        )
     if abs(height - factor * camera.height) > max(ASPECT_TOLERANCE, ASPECT_TOLERANCE * factor):
         raise BadInput(
-            f"{camera.image} has {width}×{height} pixels, which not its camera's {camera.width}×{camera.height}"
+            f"{camera.image} has {width}×{height} pixels, which are not its camera's {camera.width}×{camera.height}"
         )
     if (width, height) != (camera.width, camera.height):
         way = cv2.INTER_AREA if factor > 1 else cv2.INTER_LINEAR

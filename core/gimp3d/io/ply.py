@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BadInput
+from ..files import require_file, write_atomically
 from ..gaussians import Gaussians, pad_sh
-from ..job import write_atomically
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -95,8 +95,10 @@ def write_ply(
     BadInput
         If the file cannot be written.
     ValueError
-        If a new Gaussian is not finite.
+        If a new Gaussian is not finite, or `keep` is not a bool for each row.
     """
+    if keep.shape != (len(file.table.rows),) or keep.dtype != bool:
+        raise ValueError(f"keep: {len(file.table.rows)} bools expected, got {keep.dtype} {keep.shape}")
     table, count = file.table, int(np.count_nonzero(keep)) + (len(added) if added is not None else 0)
     lines = [
         re.sub(r"^(element vertex) \d+$", rf"\1 {count}", " ".join(h.split())) if _counts(h) else h
@@ -172,7 +174,7 @@ def header_of(path: Path) -> PlyHeader:
         If the file cannot be read or its header is damaged.
     """
     try:
-        with path.open("rb") as f:
+        with require_file(path).open("rb") as f:
             start = f.read(MAX_HEADER)
     except OSError as error:
         raise BadInput(f"cannot read {path} ({error.strerror})") from None
@@ -300,7 +302,7 @@ def values(table: PlyTable, path: Path | str = "PLY") -> np.ndarray:
         cells = np.array(b" ".join(table.rows).split(), dtype=np.float64)
     except ValueError:
         raise BadInput(f"{path}: a row holds something that is not a number") from None
-    if cells.size != width * len(table.rows):
+    if any(len(row.split()) != width for row in table.rows):  # the total may be right where lines are cut across
         raise BadInput(f"{path}: rows of {width} numbers expected; the file is damaged")
     with np.errstate(invalid="ignore", over="ignore"):
         for k, p in enumerate(table.properties):
@@ -348,6 +350,14 @@ def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
         sh=columns([f"f_dc_{k}" for k in range(3)] + higher).reshape(len(records), rest // 3 + 1, 3),
         antialiased=any(ANTIALIASED.search(c) for c in table.comments),
     )
+
+
+def positions(file: SplatFile) -> np.ndarray:
+    """The Gaussians' centres in the file's own precision, [N, 3] float64."""
+    if all(TYPES[p.type] == "f4" for p in file.table.properties if p.name in "xyz"):
+        return file.gaussians.means.astype(np.float64)
+    records = values(file.table)
+    return np.stack([records[n].astype(np.float64) for n in "xyz"], -1)
 
 
 def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:

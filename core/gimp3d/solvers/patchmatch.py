@@ -19,6 +19,7 @@ from numba import float32, int64, uint32
 
 from ..jit import inline_kernel, kernel
 from ..raster.vec16 import any_between, fma16, load1, load16, splat16, store16, sum16
+from ..schema import AtLeastOne, Seed
 from ..threads import parallel_map
 from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
 from .patches import Patches, coordinates, lay_out
@@ -37,16 +38,16 @@ TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only
 class PatchMatchSettings:
     """Costs are mean squared differences of colours in [0, 1]; lengths in pixels."""
 
-    patch: int = 5  # side, odd (paper 4.1)
+    patch: AtLeastOne = 5  # side, odd (paper 4.1)
     coherence: float = 0.001  # λ_s, weight of the spatial term (paper 4.1)
     truncation: float = 8.0  # offsets that differ by more are incoherent (METHOD section 4: local, not image-sized)
-    levels: int = 1  # of the pyramid, at most
-    grid: int = 2  # spacing of the sources that the tree holds; sweeps look at those between
+    levels: AtLeastOne = 1  # of the pyramid, at most
+    grid: AtLeastOne = 2  # spacing of the sources that the tree holds; sweeps look at those between
     tree_sweeps: int = 2  # that look into the neighbours' leaves of the tree
     sweeps: int = 4  # per level, those among them
     surface_sweeps: int = 3  # along a surface, after all others
     reach: int = 4  # of the random search round the best source
-    seed: int = 0
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Annotated
 
 import cv2
 import numpy as np
+
+from ..schema import Between, Positive, Share
 
 
 @dataclass(frozen=True)
@@ -14,12 +17,12 @@ class PlaneSettings:
     """Lengths in pixels; differences of disparity are relative to the disparity itself."""
 
     ring: int = 24  # width of the ring on which planes are sought
-    inlier: float = 0.008  # difference up to which a ring pixel lies on a plane
+    inlier: Positive = 0.008  # difference up to which a ring pixel lies on a plane
     most: int = 4  # a floor, two walls and a step
-    least: float = 0.08  # share of the ring that a plane must hold
-    tries: int = 256  # RANSAC samples per plane
-    junction: float = 0.95  # share of two planes' ring pixels that max or min must explain for them to meet
-    least_pixels: int = 10  # ring pixels below which no plane is sought
+    least: Share = 0.08  # share of the ring that a plane must hold
+    tries: Annotated[int, Between(1, 100_000)] = 256  # RANSAC samples per plane
+    junction: Share = 0.95  # share of two planes' ring pixels that max or min must explain for them to meet
+    least_pixels: Annotated[int, Between(3, 1000)] = 10  # ring pixels below which no plane is sought
 
 
 @dataclass(frozen=True)

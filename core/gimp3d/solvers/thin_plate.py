@@ -15,16 +15,18 @@ import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
 
+from ..schema import Many, Positive
+
 
 @dataclass(frozen=True)
 class ThinPlateSettings:
     """How stiff the plate is."""
 
-    smoothing: float = 1.5  # px, σ below which the values' own noise is smoothed away
-    tension: float = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
-    unknowns: int = 4000  # at most; larger domains are solved on a coarser grid
-    stiff: float = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
-    outlier: float = 4.7  # standard deviations off the stiff plate at which a value does not count; inf: all count
+    smoothing: Positive = 1.5  # px, σ below which the values' own noise is smoothed away
+    tension: Positive = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
+    unknowns: Many = 4000  # at most; larger domains are solved on a coarser grid
+    stiff: Positive = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
+    outlier: Positive = 4.7  # standard deviations off the stiff plate at which a value does not count; inf: all count
 
 
 def thin_plate(

@@ -19,6 +19,7 @@ import scipy.ndimage
 
 from ..box import Region, in_region
 from ..camera import Camera
+from ..schema import AtLeastOne
 from ..solvers.thin_plate import thin_plate
 from ..threads import parallel_map, run_ranges
 from .footprint import shows_object
@@ -67,7 +68,7 @@ class ChartSettings:
     relief: float = 0.9  # share of what photos disagree on, on the plane, that a relief may leave
     sunk: float = 0.97  # share of the photos' agreement that a plane keeps where it is laid onto the drawn surface
     height: float = 0.25  # of a relief at most; what is higher stands on the surface
-    largest: int = 900  # px, side of a chart at most
+    largest: AtLeastOne = 900  # px, side of a chart at most
 
 
 @dataclass(frozen=True)

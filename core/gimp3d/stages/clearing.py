@@ -11,6 +11,7 @@ import numpy as np
 from ..box import Region
 from ..gaussians import Gaussians
 from ..raster import drawing, footprint, label_weights, touched_window
+from ..schema import Share
 from ..threads import parallel_map
 from .charts import Chart, Hits, extent, first_hits
 from .masks import ViewMasks, sees
@@ -25,12 +26,12 @@ OBJECT, ELSE = 1, 2  # labels of a view's pixels
 class ClearingSettings:
     """When a Gaussian is haze, and what a view's target is."""
 
-    object_weight: float = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
-    some_weight: float = 0.1  # and from which it may show some of it
+    object_weight: Share = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
+    some_weight: Share = 0.1  # and from which it may show some of it
     rim: int = 1  # px by which the object is larger in the photo than in the splats
-    observed: float = 0.5  # share of a Gaussian's weight that photos must show
+    observed: Share = 0.5  # share of a Gaussian's weight that photos must show
     shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
-    solid: float = 0.5  # alpha below which the scene has no surface
+    solid: Share = 0.5  # alpha below which the scene has no surface
     low: float = 0.1  # diagonals above the surface up to which a rest of the object may stand
     margin: int = 1  # px by which a target grows within what the object hides
 

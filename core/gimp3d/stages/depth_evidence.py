@@ -10,6 +10,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel
+from ..schema import AtLeastOne, Positive, Share
 from ..threads import at_once, parallel_map
 from .layers import steps
 from .masks import ViewMasks
@@ -19,17 +20,17 @@ from .masks import ViewMasks
 class DepthEvidenceSettings:
     """Depths and disparities relative, lengths in pixels."""
 
-    unchanged: float = 0.01  # a view sees the background where removing the object moves its first surface by less
-    solid: float = 0.9  # alpha from which a surface counts as there
+    unchanged: Share = 0.01  # a view sees the background where removing the object moves its first surface by less
+    solid: Share = 0.9  # alpha from which a surface counts as there
     margin: int = 1  # px kept from what does not count
-    step: float = 0.06  # a depth edge: which pixel has which depth is not certain there
-    agreement: float = 0.03  # samples of one pixel that lie closer are of one surface
+    step: Share = 0.06  # a depth edge: which pixel has which depth is not certain there
+    agreement: Share = 0.03  # samples of one pixel that lie closer are of one surface
     least_views: int = 2  # that must agree on a surface, or on there being none
-    full: int = 4  # views that make a pixel as sure as one of the reference's own
-    beyond: float = 0.03  # how far behind a point a view must see to see past it
-    far: float = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
-    coarse: int = 4  # stride at which it is asked which parts of a view may show the hole
-    push: float = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
+    full: AtLeastOne = 4  # views that make a pixel as sure as one of the reference's own
+    beyond: Share = 0.03  # how far behind a point a view must see to see past it
+    far: Share = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
+    coarse: AtLeastOne = 4  # stride at which it is asked which parts of a view may show the hole
+    push: Positive = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
     pushes: int = 40  # at most: to 50 times the distance
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 import scipy.ndimage
 
 from ..errors import IllPosed
+from ..schema import Between, Many, Positive, Share, Signed
 from ..solvers.planes import PlaneSettings, Surface, planar_surfaces
 from ..solvers.poisson import solve_poisson
 from ..solvers.thin_plate import ThinPlateSettings, thin_plate
@@ -21,29 +23,29 @@ class DepthSettings:
     """Lengths in pixels; differences of disparity are relative to the disparity itself."""
 
     # "auto": planes where the ring lies on planes, else smooth; "planar", "smooth" (thin plate), "harmonic" insist
-    surface: str = "auto"
+    surface: Literal["auto", "planar", "smooth", "harmonic"] = "auto"
     planes: PlaneSettings = PlaneSettings()
     plate: ThinPlateSettings = ThinPlateSettings()
     layers: LayerSettings = LayerSettings()
     evidence: DepthEvidenceSettings = DepthEvidenceSettings()
-    plane_share: float = 0.65  # of the ring that must lie on planes
+    plane_share: Share = 0.65  # of the ring that must lie on planes
     tolerances: tuple[float, ...] = (1.0, 2.0, 4.0)  # of planes.inlier, tried until so much does
     plane_trust: float = 1.4  # planes are taken if they miss a withheld band by this many times a plate's miss
-    smoothing: float = 12.0  # σ of the average of what the ring deviates from a plane
+    smoothing: Positive = 12.0  # σ of the average of what the ring deviates from a plane
     skin: float = 1.5  # width of the part of the ring next to the hole that the object's haze bends
     withheld: int = 12  # width of the band by which planes and plate are compared
     plate_ring: int = 12  # width of the ring that a plate continues
-    scale_factor: float | None = None  # s_f; None: measured on the ring. The paper uses 0.1
+    scale_factor: Signed | None = None  # s_f; None: measured on the ring. The paper uses 0.1
     ring: int = 12  # width of the ring on which s_f is measured
     minimum_ring: int = 10  # ring pixels below which nothing can be measured
     # Times the miss of a withheld band without a prior, at which it is believed by half: as its fit allows, or anyhow
     prior_miss: float = 3.0
     prior_gain: float = 0.8
-    least_island: float = 0.02  # share of the hole that evidence must hold to stand alone before the surface
-    small_part: int = 64  # pixels up to which a part of the hole is just interpolated
-    low: float = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
-    high: float = 4.0
-    expected: float = 0.02  # relative error at which a pixel's confidence is one half
+    least_island: Share = 0.02  # share of the hole that evidence must hold to stand alone before the surface
+    small_part: Many = 64  # pixels up to which a part of the hole is just interpolated
+    low: Share = 0.25  # completed disparities are clamped to [low · ring's least, high · ring's greatest]
+    high: Annotated[float, Between(1)] = 4.0
+    expected: Positive = 0.02  # relative error at which a pixel's confidence is one half
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.ndimage
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..gaussians import SH_C0, Gaussians
+from ..schema import Between, Share
 from .selection import Fate, Selection, Weights
 from .surroundings import SurroundingsSettings, follow_surroundings
 
@@ -31,11 +32,11 @@ class GrowthSettings:
     touch: float = (
         4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
     )
-    colour: float = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
-    bins: int = 12  # of each channel in the histograms of the object's and the surroundings' colours
-    likely: float = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
-    unlikely: float = 0.1  # probability up to which one off the surface is something else
-    share: float = 0.1  # of a part's Gaussians that the boxes must hold
+    colour: Share = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
+    bins: Annotated[int, Between(1, 64)] = 12  # of each channel in the histograms of both their colours
+    likely: Share = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
+    unlikely: Share = 0.1  # probability up to which one off the surface is something else
+    share: Share = 0.1  # of a part's Gaussians that the boxes must hold
     least: int = 10  # Gaussians of a piece that is worth proposing
     shown: float = 0.5  # weight below which a Gaussian shows nothing
     large: float = 0.25  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import scipy.ndimage
 
+from ..schema import Positive, Share
 from ..solvers.poisson import solve_poisson
 
 AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
@@ -18,13 +19,13 @@ AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
 class LayerSettings:
     """Lengths in pixels; steps of disparity are relative."""
 
-    step: float = 0.06  # on the rim, that parts two layers
+    step: Positive = 0.06  # on the rim, that parts two layers
     band: int = 4  # width of the ring on which layers are told apart
-    least: float = 0.1  # share of the rim that a layer must hold to reach into the hole
-    occluder_share: float = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
+    least: Share = 0.1  # share of the rim that a layer must hold to reach into the hole
+    occluder_share: Share = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
     reach: int = 24  # width of the ring in which a surface in front of the object is followed
-    front_share: float = 0.05  # of a part of that ring that must be seen to be in front
-    straight: float = 0.97  # share of two layers' ring pixels that a line must part for it to be their border
+    front_share: Share = 0.05  # of a part of that ring that must be seen to be in front
+    straight: Share = 0.97  # share of two layers' ring pixels that a line must part for it to be their border
 
 
 def steps(

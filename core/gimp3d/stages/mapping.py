@@ -9,6 +9,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..jit import exact_kernel
+from ..schema import Share, Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
 from ..threads import run_ranges
@@ -21,8 +22,8 @@ MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has f
 class MappingSettings:
     """How sources are judged."""
 
-    visibility: float = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
-    depth_tolerance: float = 0.02  # z-test of visibility, relative
+    visibility: Signed = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
+    depth_tolerance: Share = 0.02  # z-test of visibility, relative
     geometry: bool = True  # patches lie on the surface (METHOD section 4); the paper's lie in the picture
     as_printed: bool = False  # patches are compared at f(p) and copied from p + f(p): the paper's cost misses p
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)

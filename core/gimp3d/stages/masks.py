@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import drawing, render, touched_window
+from ..schema import Positive, Share
 from ..threads import parallel_map
 from .growth import NOTHING, Growth, GrowthSettings, find_growth
 from .outline import (
@@ -58,27 +59,27 @@ R = TypeVar("R")
 class MaskSettings:
     """How target regions are found. Lengths in pixels, depths relative."""
 
-    mode: str = "need"  # "need": only what no view shows; "paper": polygon minus guard footprints
-    guard_scale: float = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
-    guard_footprint: float = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
-    changed: float = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
-    hides: float = 0.5  # blend weight of removed Gaussians above which a pixel shows nothing else
-    solid: float = 0.9  # alpha after removal from which a surface counts as there
-    void: float = 0.1  # alpha after removal below which there is nothing
-    depth_tolerance: float = 0.02  # relative z difference within which two views see the same surface
-    near: float = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
-    layer_step: float = 0.05  # relative z step between neighbouring pixels that parts two surfaces
-    occluder_step: float = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
-    infinity: float = 10.0  # distances of the object from which a surface is sky
+    mode: Literal["need", "paper"] = "need"  # "need": only what no view shows; "paper": polygon minus guard footprints
+    guard_scale: Positive = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
+    guard_footprint: Share = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill
+    changed: Share = 0.02  # blend weight of removed Gaussians above which the object touched a pixel
+    hides: Share = 0.5  # blend weight of removed Gaussians above which a pixel shows nothing else
+    solid: Share = 0.9  # alpha after removal from which a surface counts as there
+    void: Share = 0.1  # alpha after removal below which there is nothing
+    depth_tolerance: Share = 0.02  # relative z difference within which two views see the same surface
+    near: Positive = 1e-3  # near plane for clipping the box, as a share of the box's diagonal
+    layer_step: Share = 0.05  # relative z step between neighbouring pixels that parts two surfaces
+    occluder_step: Share = 0.03  # of disparity (relative) by which a kept surface, continued, lies before the object
+    infinity: Positive = 10.0  # distances of the object from which a surface is sky
     least_outside: int = 20  # px of a surface that must lie beyond the object for it to count as continuing there
     least_border: float = (
         0.25  # and times `around` and the root of what the object covers of it: leaks have a narrow rim
     )
     margin: int = 2  # px by which a target grows, against the rim's mixed pixels
     around: int = 24  # px round what the object touched that are drawn anew without it
-    usual_agreement: float = 0.97  # share of surface that two views of a good scan place alike
-    least_agreement: float = 0.5  # share of surface that two views must place alike, else the mode is "paper"
-    least_likeness: float = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
+    usual_agreement: Share = 0.97  # share of surface that two views of a good scan place alike
+    least_agreement: Share = 0.5  # share of surface that two views must place alike, else the mode is "paper"
+    least_likeness: Share = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
     selection: SelectionSettings = SelectionSettings()
     grow: bool = False  # take along what of the object the boxes cut off
     growth: GrowthSettings = GrowthSettings()

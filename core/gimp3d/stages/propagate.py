@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
+from ..schema import AtLeastOne, Share
 from ..solvers.colours import NO_CHANGE, ColourChange, biweight, exposure_gain, learn_change
 from ..solvers.poisson import solve_poisson
 from ..threads import at_once, parallel_map, run_ranges
@@ -56,14 +58,16 @@ OWN, REFERENCE, UNREACHED, RETARGETED, OTHER = 2, 3, 4, 5, 6  # the same, for th
 class PropagateSettings:
     """Lengths in pixels, depths relative."""
 
-    transfer: str = "learned"  # "learned": the reference's colours, changed as this view's pixels tell; "sample": the
-    # colours of this view's mapped sources (paper); "none": the warped reference
-    blend: str = "band"  # "band": fitted to the photo round the hole; "rim": to the rim's pixels alone (paper)
-    patch: int = 5  # overlapping patches that are compared and blended (paper 4.1: 5 × 5)
-    depth_tolerance: float = 0.02  # z-test
-    evidence_tolerance: float = 0.006  # how near the photo's own surface must be to the new one to be taken as it
-    smooth_tolerance: float = 0.005  # how far depths may differ within one surface when their noise is averaged
-    seam: float = 0.05  # depth step between neighbours that parts two surfaces
+    # "learned": the reference's colours, changed as this view's pixels tell; "sample": the colours of this view's
+    # mapped sources (paper); "none": the warped reference
+    transfer: Literal["learned", "sample", "none"] = "learned"
+    # "band": fitted to the photo round the hole; "rim": to the rim's pixels alone (paper)
+    blend: Literal["band", "rim"] = "band"
+    patch: AtLeastOne = 5  # overlapping patches that are compared and blended (paper 4.1: 5 × 5)
+    depth_tolerance: Share = 0.02  # z-test
+    evidence_tolerance: Share = 0.006  # how near the photo's own surface must be to the new one to be taken as it
+    smooth_tolerance: Share = 0.005  # how far depths may differ within one surface when their noise is averaged
+    seam: Share = 0.05  # depth step between neighbours that parts two surfaces
     surroundings: float = 0.75  # width of what the blend looks at round the hole, over the root of the hole's area
     mapped: float = 0.5  # weight of all mapped sources against the surroundings in learning the change of colours
     retarget: int = 32  # px round a source that is hidden or off-screen, searched for another; 0: none

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..errors import IllPosed
+from ..schema import AtLeastOne, Many, Share
 from ..solvers.thin_plate import ThinPlateSettings
 from ..threads import parallel_map
 from .depth import DepthSettings, complete_disparity
@@ -26,8 +27,8 @@ class ReferenceSettings:
     """How the hidden surface is sampled and what a view of it is worth. Lengths in pixels."""
 
     minimum_pixels: int = 1  # a view with fewer hole pixels cannot be the reference
-    surface_views: int = 12  # views, evenly chosen, that say where the hidden surface may be
-    samples: int = 2000  # of the surface from each of them, about
+    surface_views: AtLeastOne = 12  # views, evenly chosen, that say where the hidden surface may be
+    samples: Many = 2000  # of the surface from each of them, about
     most_extra: int = 8  # further references that a plan looks ahead
 
 
@@ -247,10 +248,10 @@ def _plan(
 class EvidenceSettings:
     """When a photo counts as a true picture of the surface behind the object. Depths relative, lengths in pixels."""
 
-    tolerance: float = 0.006  # how near a view's first surface must be to the completed one
+    tolerance: Share = 0.006  # how near a view's first surface must be to the completed one
     margin: int = 3  # px round the sample that must not hold something nearer
     contact: int = 4  # px that evidence keeps away from what no photo shows: where the object touches the surface
-    nearer: float = 0.03  # how much nearer counts as an occluder
+    nearer: Share = 0.03  # how much nearer counts as an occluder
 
 
 @dataclass(frozen=True)

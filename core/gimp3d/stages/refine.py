@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_region
+from ..schema import AtLeastOne, Between, Share
 from ..threads import parallel_map
 from .propagate import Rule
 
@@ -27,13 +28,13 @@ BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 class RefineSettings:
     """How the new Gaussians are optimised. Lengths in pixels."""
 
-    steps: int = 0  # one view each; 0: the closed form is final
-    views: int = 48  # as many of the painted ones at most: each holds its part of the scene in memory
-    ssim: float = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
+    steps: Annotated[int, Between(0, 1_000_000)] = 0  # one view each; 0: the closed form is final
+    views: AtLeastOne = 48  # as many of the painted ones at most: each holds its part of the scene in memory
+    ssim: Share = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
     margin: int = 4  # of known picture round the target that counts as well: no visible seam
-    held_out: int = 8  # every so many views is not learned from; it says when to stop
-    check: int = 25  # steps between two looks at the held-out views
-    patience: int = 2  # looks without an improvement before it stops
+    held_out: Annotated[int, Between(2, 1000)] = 8  # every so many views is not learned from; it says when to stop
+    check: AtLeastOne = 25  # steps between two looks at the held-out views
+    patience: AtLeastOne = 2  # looks without an improvement before it stops
     # Learning rates of Adam; that of means is in units of the Gaussians' median size, per step
     rate_means: float = 0.02
     rate_scales: float = 0.005

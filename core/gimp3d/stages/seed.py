@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
+from ..schema import AtLeastOne, Between, Positive, Share
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from ..threads import parallel_map
@@ -31,24 +33,25 @@ LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
 class SeedSettings:
     """How the completed reference becomes Gaussians."""
 
-    spread: float = 0.75  # standard deviation on screen, low-pass included, in sides of the splat's patch
-    largest: int = 4  # px, a power of two: the longest side of a patch; 1: one Gaussian per pixel (paper)
+    spread: Positive = 0.75  # standard deviation on screen, low-pass included, in sides of the splat's patch
+    # px, a power of two: the longest side of a patch; 1: one Gaussian per pixel (paper)
+    largest: Annotated[int, Between(1, 64)] = 4
     detail: float = 20.0  # squared grey levels × px, summed over channels: a patch whose colours vary more is halved
     bend: float = 0.002  # RMS deviation from a plane, relative to the depth, above which a patch is halved
-    maximum_slant: float = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
-    thickness: float = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
-    opacity: float = 0.98
+    maximum_slant: Annotated[float, Between(1)] = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
+    thickness: Positive = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
+    opacity: Annotated[float, Between(0.01, 0.999)] = 0.98
     sink: float = 0.25  # depth under the surface, in standard deviations; see settle_gaussians
-    needed: float = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
+    needed: Share = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
     corrections: int = 1  # steps by which colours are corrected so that the scene, drawn, shows the painted views
     hold: float = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
-    looks: int = 12  # painted views that both of these are judged by
-    sh_degree: int = 2  # the highest of new Gaussians; each gets the one that its observations support
+    looks: AtLeastOne = 12  # painted views that both of these are judged by
+    sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new Gaussians; each gets what its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
     harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
     grey: float = 0.5  # what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
-    depth_tolerance: float = 0.02  # z-test of observations
+    depth_tolerance: Share = 0.02  # z-test of observations
 
 
 def seed_gaussians(

@@ -15,6 +15,7 @@ from ..box import Region, in_region
 from ..camera import Camera
 from ..gaussians import Gaussians, quats_to_matrices
 from ..raster import label_weights
+from ..schema import Share
 from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 from .surroundings import Surroundings, SurroundingsSettings
@@ -43,18 +44,18 @@ class SelectionSettings:
     """What counts as the object. Weights are blend weights, summed over pixels and views."""
 
     by_centre: bool = False  # the paper's rule: nothing but centres in the region counts
-    straddle: float = 0.02  # share of a Gaussian's mass in the region from which it reaches in
-    mostly: float = 0.5  # share of its mass, or of its weight, that decides
+    straddle: Share = 0.02  # share of a Gaussian's mass in the region from which it reaches in
+    mostly: Share = 0.5  # share of its mass, or of its weight, that decides
     slack: float = 1.0  # how far outside the boxes surface may still be the object's, cells of the surroundings
     rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
     large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
     shown: float = 0.5  # weight below which a Gaussian shows nothing
-    support: float = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
-    least_object: float = 0.002  # share of the region's outline that an object fills in some view to stand in a box
+    support: Share = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
+    least_object: Share = 0.002  # share of the region's outline that an object fills in some view to stand in a box
     least_cells: float = 4.0  # of the surroundings along a box; in coarser ones its centre decides of a Gaussian
     near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
-    least_misfit: float = 0.1  # … and by so much, colours in [0, 1]
+    least_misfit: Share = 0.1  # … and by so much, colours in [0, 1]
     surroundings: SurroundingsSettings = SurroundingsSettings()
 
 

@@ -17,6 +17,7 @@ import scipy.ndimage
 from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..jit import exact_kernel
+from ..schema import AtLeastOne, Degrees, Many, Positive, Share
 from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 
@@ -28,16 +29,16 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 
 class SurroundingsSettings:
     """How surface is followed into a box. Lengths in cells unless said otherwise."""
 
-    cells: int = 800_000  # of the grid round one box at most
-    least_cell: float = 1.5  # edge of a cell, pixels of a usual view
-    least_points: int = 3  # in a cell that counts as surface
+    cells: Many = 800_000  # of the grid round one box at most
+    least_cell: Positive = 1.5  # edge of a cell, pixels of a usual view
+    least_points: AtLeastOne = 3  # in a cell that counts as surface
     beyond: float = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
-    seeds: float = 0.1  # width of the grid's outer layer, where growth starts, as such a share
-    views: int = 60  # at most so many, spread evenly, are gathered
+    seeds: Share = 0.1  # width of the grid's outer layer, where growth starts, as such a share
+    views: AtLeastOne = 60  # at most so many, spread evenly, are gathered
     step: float = 0.6  # how far a cell may lie off the plane of those reached before it
-    turn: float = 50.0  # degrees that its normal may differ from theirs
-    steady: float = 20.0  # degrees up to which a cell's own normal bends the plane that it hands on …
-    adapt: float = 0.25  # … and with what weight
+    turn: Degrees = 50.0  # degrees that its normal may differ from theirs
+    steady: Degrees = 20.0  # degrees up to which a cell's own normal bends the plane that it hands on …
+    adapt: Share = 0.25  # … and with what weight
     support: int = 4  # cells within two that must have been reached before
     thickness: float = 0.5  # how far off its plane a point still belongs to the surface
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -191,6 +192,32 @@ REFUSALS = {
         "fisheye",
     ),
     "k4": ({"fl_x": 5, "k4": 0.1, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "k4"),
+    "width of another type": ({"fl_x": 5, "w": [10], "frames": [{"file_path": "a", "transform_matrix": POSE}]}, ": w:"),
+    "no angle": ({"camera_angle_x": 0, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "camera_angle_x"),
+    "null angle": ({"camera_angle_x": None, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "no focal"),
+    "endless angle": (
+        {"camera_angle_x": float("inf"), "frames": [{"file_path": "a", "transform_matrix": POSE}]},
+        "camera_angle_x",
+    ),
+    "a lens of a million pixels": ({"fl_x": 1e7, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "no lens"),
+    "400 digits": ({"fl_x": 10**400, "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "fl_x: a finite"),
+    "400 digits in a pose": ({"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": [[10**400]]}]}, "finite"),
+    "huge pose": (
+        {"fl_x": 5, "frames": [{"file_path": "a", "transform_matrix": (1e200 * np.eye(4)).tolist()}]},
+        "sense",
+    ),
+    "too many pixels": (
+        {"fl_x": 5e4, "w": 65535, "h": 65535, "frames": [{"file_path": "a", "transform_matrix": POSE}]},
+        "makes no sense",
+    ),
+    "frames of another type": ({"fl_x": 5, "frames": [5, None]}, "no transform_matrix"),
+    "300 letters": ({"fl_x": 5, "frames": [{"file_path": "a" * 300, "transform_matrix": POSE}]}, "longer than"),
+    "lone surrogate": ({"fl_x": 5, "frames": [{"file_path": "\ud800", "transform_matrix": POSE}]}, "no text"),
+    "line break": ({"fl_x": 5, "frames": [{"file_path": "a\nb", "transform_matrix": POSE}]}, "no file can"),
+    "one output name": (
+        {"fl_x": 5, "frames": [{"file_path": n, "transform_matrix": POSE} for n in ("a.png", "a.jpg")]},
+        "one name",
+    ),
     "bad split": ({"fl_x": 5, "split": "x", "frames": [{"file_path": "a", "transform_matrix": POSE}]}, "split"),
 }
 
@@ -202,6 +229,33 @@ def test_bad_camera_files_are_refused_in_one_line(name: str, tmp_path: Path) -> 
     with pytest.raises(BadInput, match=words) as caught:
         read_cameras(tmp_path / "t.json")
     assert "\n" not in str(caught.value)
+
+
+ENTRY = {
+    "img_name": "a",
+    "rotation": np.eye(3).tolist(),
+    "position": [0, 0, 0],
+    "fx": 5,
+    "fy": 5,
+    "width": 9,
+    "height": 9,
+}
+
+
+@pytest.mark.parametrize(
+    "entry", [None, 5, "x", [], {**ENTRY, "width": None}, {**ENTRY, "fx": "5"}, {**ENTRY, "rotation": "1"}]
+)
+def test_bad_entries_of_inrias_file_are_refused(entry: object, tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text(json.dumps([ENTRY, entry]))
+    with pytest.raises(BadInput, match="camera 1"):
+        read_cameras(tmp_path / "c.json")
+
+
+def test_a_photo_of_one_pixel_is_refused(tmp_path: Path) -> None:
+    camera = Camera("p.png", 60, 40, 50, 50, 30, 20, np.eye(4), image=tmp_path / "p.png")
+    write_png(tmp_path / "p.png", np.zeros((1, 1, 3), np.uint8))
+    with pytest.raises(BadInput, match="far fewer"):
+        load_view(camera)
 
 
 @pytest.mark.parametrize("cut", [4, 30, 70])
@@ -250,3 +304,23 @@ def test_a_pose_that_another_program_changed_counts(views: tuple[Camera, ...], t
     back = read_cameras(tmp_path / "t.json")
     assert back[0].centre[0] == pytest.approx(views[0].centre[0] + 1e-6, abs=1e-12)
     assert np.allclose(back[1].viewmat, views[1].viewmat, atol=1e-12)
+
+
+def test_a_colmap_name_that_no_file_can_have_is_said_in_one_line(views: tuple[Camera, ...], tmp_path: Path) -> None:
+    """Found by make fuzz."""
+    colmap(tmp_path, views, binary=True)
+    whole = (tmp_path / "images.bin").read_bytes()
+    name = views[0].id.encode()
+    (tmp_path / "images.bin").write_bytes(whole.replace(name, b"\n" + name[1:]))
+    with pytest.raises(BadInput, match="no file can") as caught:
+        read_cameras(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_picture_that_claims_a_billion_pixels_is_refused(tmp_path: Path) -> None:
+    header = struct.pack(">4sIIBBBBB", b"IHDR", 32_000, 32_000, 8, 6, 0, 0, 0)
+    chunks = [header, b"IDAT" + zlib.compress(bytes(1000)), b"IEND"]
+    body = b"".join(struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    with pytest.raises(BadInput, match="not a picture"):
+        read_image(tmp_path / "bomb.png")

@@ -5,7 +5,12 @@ from __future__ import annotations
 import gzip
 import json
 import struct
+import sys
+import tracemalloc
 import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -309,6 +314,112 @@ def test_a_property_that_comes_twice_is_said(tmp_path: Path) -> None:
         with pytest.raises(BadInput, match=r"more than once|twice") as error:
             read_scene(path)
         assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """No more than 100 MB beyond what is taken already may be taken inside."""
+    import resource
+
+    limit, taken = resource.getrlimit(resource.RLIMIT_AS), Path("/proc/self/statm").read_text().split()[0]
+    resource.setrlimit(resource.RLIMIT_AS, (int(taken) * resource.getpagesize() + (100 << 20), limit[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, limit)
+
+
+def gzipped_zeros(path: Path, start: bytes, size: int) -> None:
+    """`start` and then zeros, packed without ever lying in memory as a whole."""
+    packer = zlib.compressobj(1, zlib.DEFLATED, 31)
+    with path.open("wb") as file:
+        file.write(packer.compress(start))
+        for _ in range(size >> 20):
+            file.write(packer.compress(bytes(1 << 20)))
+        file.write(packer.flush())
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the limit is Linux's")
+@pytest.mark.usefixtures("little_memory")
+def test_a_file_takes_no_more_memory_than_its_count_needs(tmp_path: Path) -> None:
+    def header(count: int) -> bytes:
+        return b"NGSP" + struct.pack("<IIBBBB", 2, count, 0, 12, 0, 0)
+
+    gzipped_zeros(tmp_path / "few.spz", header(2), 128 << 20)  # the rest is never unpacked
+    assert len(read_scene(tmp_path / "few.spz").gaussians) == 2
+    gzipped_zeros(tmp_path / "many.spz", header(16 << 20), 128 << 20)
+    with pytest.raises(MemoryError, match="16777216 Gaussians"):
+        read_scene(tmp_path / "many.spz")
+    whole = zipfile.ZipFile(tmp_path / "meta.sog", "w", zipfile.ZIP_DEFLATED)
+    with whole as archive, archive.open("meta.json", "w") as meta:
+        for _ in range(20):
+            meta.write(b" " * (1 << 20))
+    with pytest.raises(BadInput, match="larger than 16 MiB"):
+        read_scene(tmp_path / "meta.sog")
+
+
+def test_a_zstd_frame_that_lies_about_its_size_is_refused(tmp_path: Path) -> None:
+    header, *streams = spz_body(some(10), 4)
+    packed = [bytearray(zstandard.ZstdCompressor(level=1).compress(s)) for s in streams if s]
+    head = header[:15] + bytes([len(packed)]) + struct.pack("<I", 32) + bytes(12)
+    for claimed in (1 << 40, 10**5):
+        table = b"".join(struct.pack("<QQ", len(p), claimed) for p in packed)
+        (tmp_path / "a.spz").write_bytes(head + table + b"".join(packed))
+        with pytest.raises(BadInput, match="more than its Gaussians need"):
+            read_scene(tmp_path / "a.spz")
+    lies = zstandard.ZstdCompressor().compress(bytes(1 << 26))  # 64 MB in a frame of which the table tells 90 bytes
+    table = b"".join(struct.pack("<QQ", len(lies), len(s)) for s in streams if s)
+    (tmp_path / "a.spz").write_bytes(head + table + lies * len(packed))
+    tracemalloc.start()
+    with suppress(BadInput):
+        read_scene(tmp_path / "a.spz")
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()
+
+
+SOG_DAMAGE = {
+    "no mapping": [],
+    "count beyond its pixels": {"count": 10_000},
+    "negative count": {"count": -1},
+    "text for a count": {"count": "x"},
+    "no files": {"means": {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": []}},
+    "a file of another type": {"quats": {"files": [5]}},
+    "numbers for files": {"quats": 5},
+    "a codebook of lists": {"count": 0, "sh0": {"codebook": [[]], "files": ["sh0.webp"]}},
+    "nothing for limits": {"means": {"mins": None, "maxs": {}, "files": ["means_l.webp", "means_u.webp"]}},
+}
+
+
+@pytest.mark.parametrize("case", SOG_DAMAGE)
+def test_a_description_that_makes_no_sense_is_refused(case: str, tmp_path: Path) -> None:
+    files, change = sog_files(some(10)), SOG_DAMAGE[case]
+    meta = json.loads(files["meta.json"])
+    files["meta.json"] = json.dumps({**meta, **change} if isinstance(change, dict) else change).encode()
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises((BadInput, MemoryError), match=r"meta\.json|picture"):
+        read_scene(tmp_path)
+
+
+def test_an_archive_with_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Found by make fuzz."""
+    files = {**sog_files(some(10)), "ä.txt": b""}
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    whole = (tmp_path / "a.sog").read_bytes()
+    (tmp_path / "a.sog").write_bytes(whole.replace("ä".encode(), b"\xab\xab"))
+    with pytest.raises(BadInput, match="damaged"):
+        read_scene(tmp_path / "a.sog")
+
+
+def test_a_picture_far_larger_than_the_count_needs_is_refused(tmp_path: Path) -> None:
+    files = sog_files(some(10))
+    files["quats.webp"] = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[
+        1
+    ].tobytes()
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(BadInput, match="far larger"):
+        read_scene(tmp_path)
 
 
 def test_what_is_no_scene_is_said(tmp_path: Path) -> None:

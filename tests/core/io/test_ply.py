@@ -196,3 +196,22 @@ def test_real_scenes_round_trip(shared_data: Path, tmp_path: Path) -> None:
         assert (tmp_path / "out.ply").read_bytes() == path.read_bytes()
     with pytest.raises(BadInput, match="compressed"):
         read_ply(shared_data / "real" / "playcanvas" / "biker.compressed.ply")
+
+
+@pytest.mark.parametrize(
+    "body", ["0 1 2 3 4 5 6 7\n8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24 25 26 27\n", "0\n" * 2]
+)
+def test_ascii_rows_that_are_cut_across_lines_are_refused(body: str, tmp_path: Path) -> None:
+    names = [*XYZ, *DC, "opacity", *SCALE, *ROT]
+    header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {n}" for n in names), "end_header", ""]
+    (tmp_path / "cut.ply").write_text("\n".join(header) + body)
+    with pytest.raises(BadInput, match="rows of 14 numbers"):
+        read_ply(tmp_path / "cut.ply")
+
+
+@pytest.mark.parametrize("keep", [np.ones(3, bool), np.ones((20, 1), bool), np.ones(20), np.arange(20)], ids=str)
+def test_only_a_bool_per_row_says_what_is_kept(keep: np.ndarray, tmp_path: Path) -> None:
+    make(tmp_path / "in.ply", LAYOUTS["inria"])
+    with pytest.raises(ValueError, match="keep: 20 bools"):
+        write_ply(tmp_path / "out.ply", read_ply(tmp_path / "in.ply"), keep)
+    assert not (tmp_path / "out.ply").exists()

@@ -1,0 +1,189 @@
+"""Files of others read with care, and our own written so that a fault leaves what was there."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from .errors import BadInput
+
+UNFINISHED = ".gimp3d-part"  # ends the names of files that are being written
+
+
+def user_state_folder() -> Path:
+    """Where this user's own records and logs lie: GIMP3D_STATE, else the system's folder for them."""
+    if "GIMP3D_STATE" in os.environ:
+        return Path(os.environ["GIMP3D_STATE"])
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local")) / "gimp3d" / "state"
+    if sys.platform == "darwin":
+        return Path.home() / "Library/Application Support/gimp3d"
+    return Path(os.environ.get("XDG_STATE_HOME", Path.home() / ".local/state")) / "gimp3d"
+
+
+def require_file(path: Path) -> Path:
+    """The path, if a file lies there or nothing does: a pipe has no end and no second reading.
+
+    Raises
+    ------
+    BadInput
+        If it is a pipe, a socket or a device.
+    """
+    try:
+        kind = path.stat().st_mode
+    except (OSError, ValueError):  # whoever opens it says why it cannot be read
+        return path
+    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+        raise BadInput(f"{path} is a pipe or a device; a file is needed, as it is read more than once")
+    return path
+
+
+def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Let `write(file)` fill a temporary file beside `path`, then move it there; nothing half-written stays.
+
+    A link is followed and the file's permissions are kept. A pipe or a device is written to as it is.
+
+    Raises
+    ------
+    BadInput
+        If the folder cannot be written or the disk is full.
+    """
+    try:
+        if is_stream(path):
+            with path.open("wb", buffering=0) as stream:
+                write(_Whole(stream))  # type: ignore[arg-type]
+            return
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(f".{os.getpid()}{UNFINISHED}", f".{_short(target.name)}.", target.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                write(file)
+                file.flush()
+                os.fsync(file.fileno())
+            _take_permissions(name, target)
+            os.replace(name, target)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(name)
+            raise
+    except OSError as error:
+        raise BadInput(f"cannot write {path} ({error.strerror or error})") from None
+
+
+def try_target(path: Path, is_folder: bool = False) -> None:
+    """Raise BadInput now if `path`, or a file in the folder `path`, could not be written later."""
+    try:
+        if is_stream(path):
+            if is_folder or not os.access(path, os.W_OK):
+                raise BadInput(f"cannot write {path} (a pipe or device)")
+            return
+        target = Path(os.path.realpath(path))
+        if target.exists() and target.is_dir() != is_folder:
+            raise BadInput(f"cannot write {path} (it is {'a file' if is_folder else 'a folder'})")
+        place = target if is_folder else target.parent
+        while not place.exists() and place != place.parent:
+            place = place.parent
+        with tempfile.TemporaryFile(prefix=".gimp3d-", dir=place):
+            pass
+        os.lstat(place / target.name)  # fails where the name is too long
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise BadInput(f"cannot write {path} ({getattr(error, 'strerror', None) or error})") from None
+
+
+def sweep(folders: Iterable[Path]) -> None:
+    """Delete what killed runs left half-written in folders; what a living process writes stays."""
+    for folder in set(folders):
+        with suppress(OSError):
+            for left in folder.glob(f".*{UNFINISHED}"):
+                owner = re.search(rf"\.(\d+){re.escape(UNFINISHED)}$", left.name)
+                if owner and not _alive(int(owner[1])):
+                    with suppress(OSError):
+                        left.unlink()
+
+
+def is_stream(path: Path) -> bool:
+    """A pipe, a socket or a device, which is written to and never replaced."""
+    try:
+        kind = os.stat(path).st_mode
+    except OSError:
+        return False
+    return not stat.S_ISREG(kind) and not stat.S_ISDIR(kind)
+
+
+def identity(path: Path) -> tuple[int, ...] | None:
+    """Tells a file from what replaces it; None where there is none."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
+
+
+class _Whole:
+    """A stream without buffer that takes every byte, and no seeking."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._at = stream, 0
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data).cast("B")
+        size = len(rest)
+        while len(rest):
+            rest = rest[self._stream.write(rest) :]
+        self._at += size
+        return size
+
+    def flush(self) -> None:
+        pass
+
+    def tell(self) -> int:
+        return self._at
+
+    def read(self, *_: Any) -> bytes:
+        raise OSError("a stream is written only")
+
+
+def _take_permissions(name: str, target: Path) -> None:
+    """A new file gets the permissions, and where that is allowed the owner, of the one that it replaces."""
+    try:
+        old = target.stat()
+    except OSError:
+        os.chmod(name, 0o666 & ~_umask())
+        return
+    if hasattr(os, "chown"):
+        with suppress(OSError):
+            os.chown(name, old.st_uid, old.st_gid)
+    os.chmod(name, stat.S_IMODE(old.st_mode))
+
+
+def _short(name: str) -> str:
+    """So much of a name that a temporary one is no longer than file systems allow."""
+    return name.encode()[:100].decode(errors="ignore")
+
+
+def _alive(process: int) -> bool:
+    if os.name != "posix":  # there, a file that is open cannot be deleted
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return process != os.getpid()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,198 @@
+"""What comes from outside against what is expected: one reader for JSON, one for values by their type and bounds.
+
+Our own hundred lines, as camera files are read inside Blender, where only NumPy is at hand: a compiled validator would
+be one more wheel for every platform and Python, and the small zip carries none.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from .errors import BadInput
+
+T = TypeVar("T")
+LARGEST_JSON = 256 << 20  # bytes; a camera takes about 1 kB
+
+
+@dataclass(frozen=True)
+class Between:
+    """The least and the greatest value that a number may have."""
+
+    low: float = -math.inf
+    high: float = math.inf
+
+    def __str__(self) -> str:
+        if math.isinf(self.high):
+            return f"{self.low:g} or more"
+        return f"from {self.low:g} to {self.high:g}"
+
+
+# Types of settings. A plain number is from 0 to 1,000.
+Share = Annotated[float, Between(0, 1)]
+Positive = Annotated[float, Between(1e-9)]
+Signed = Annotated[float, Between()]
+Degrees = Annotated[float, Between(0, 180)]
+AtLeastOne = Annotated[int, Between(1, 1_000)]
+Many = Annotated[int, Between(1, 10_000_000)]
+Seed = Annotated[int, Between(0, 2**32 - 1)]
+SETTING = {float: Between(0, 1_000), int: Between(0, 1_000)}
+ANY = {float: Between(), int: Between()}
+
+
+def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> Any:
+    """A JSON file's document.
+
+    Raises
+    ------
+    BadInput
+        If it cannot be read, is too large, or is not JSON that a person or program could mean.
+    """
+    try:
+        if not path.is_file() and path.exists():
+            raise BadInput(f"{what}: {path} is not a file")
+        with path.open("rb") as file:
+            text = file.read(largest + 1)
+    except OSError as error:
+        raise BadInput(f"{what}: cannot read {path} ({error.strerror})") from None
+    return parse_json(text, f"{what}: {path}", largest)
+
+
+def parse_json(text: bytes, where: str, largest: int = LARGEST_JSON) -> Any:
+    """The document of a JSON text; raises as read_json does."""
+    if len(text) > largest:
+        raise BadInput(f"{where} is larger than {largest >> 20} MiB")
+    try:
+        return json.loads(text.decode("utf-8-sig"))
+    except ValueError as error:
+        raise BadInput(f"{where} is not JSON ({error})") from None
+    except RecursionError:
+        raise BadInput(f"{where} is not JSON (nested too deep)") from None
+
+
+def checked(
+    kind: Any,
+    value: Any,
+    where: str,
+    bounds: Mapping[type, Between] = ANY,  # of numbers that do not bring their own
+    extra: bool = False,  # mappings may hold keys that a dataclass does not know
+) -> Any:
+    """A JSON value as the type that is expected: numbers, str, bool, Literal, unions with None, mappings, dataclasses.
+
+    Raises
+    ------
+    BadInput
+        If it is of another type or out of bounds.
+    """
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return value
+    if origin is Annotated:
+        return checked(arguments[0], value, where, {**bounds, arguments[0]: arguments[1]}, extra)
+    if origin is Literal:
+        if not any(value == a and type(value) is type(a) for a in arguments):
+            raise BadInput(f"{where}: {' or '.join(map(str, arguments))} expected, got {shown(value)}")
+        return value
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        (one,) = (a for a in arguments if a is not type(None))
+        return checked(one, value, where, bounds, extra)
+    if origin is list:
+        items = _as(list, value, where, "a list")
+        return [checked(arguments[0], item, where, bounds, extra) for item in items]
+    if origin is dict:
+        pairs = _as(dict, value, where, "a mapping")
+        of_key, of_value = arguments
+        return {checked(of_key, k, where): checked(of_value, v, f"{where}.{k}") for k, v in pairs.items()}
+    if kind in (float, int):
+        return _number(kind, value, where, bounds[kind])
+    if kind is bool:
+        return _as(bool, value, where, "true or false")
+    if kind is str:
+        return _text(value, where)
+    if is_dataclass(kind):
+        return _dataclass(kind, value, where, bounds, extra)
+    raise TypeError(f"no reader for {kind}")
+
+
+def within(settings: Any, where: str) -> None:
+    """Raise BadInput if a setting, or one of those inside it, is out of its bounds."""
+    for name, kind in kinds(type(settings)).items():  # type: ignore[arg-type]
+        value = getattr(settings, name)
+        if is_dataclass(value):
+            within(value, f"{where}{name}.")
+        elif not isinstance(value, tuple):
+            checked(kind, value, f"{where}{name}", SETTING)
+
+
+@cache
+def kinds(kind: Any) -> dict[str, Any]:
+    """The types of a dataclass's fields, by name."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {f.name: hints[f.name] for f in fields(kind)}
+
+
+def shown(value: Any) -> str:
+    """A value for an error's line: one that is short and printable."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        text = "a very long number"
+    text = text.encode("utf-8", "backslashreplace").decode()
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def _number(kind: type, value: Any, where: str, bounds: Between) -> float | int:
+    what = "a whole number" if kind is int else "a number"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInput(f"{where}: {what} expected, got {shown(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number) or (kind is int and number != int(number)):
+        raise BadInput(f"{where}: {'a finite number' if kind is float else what} expected, got {shown(value)}")
+    if not bounds.low <= number <= bounds.high:
+        raise BadInput(f"{where}: must be {bounds}, got {shown(value)}")
+    return kind(value)
+
+
+def _text(value: Any, where: str) -> str:
+    text = _as(str, value, where, "a text")
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        raise BadInput(f"{where}: {shown(text)} is no text that a file can hold") from None
+    return text
+
+
+def _as(kind: type[T], value: Any, where: str, what: str) -> T:
+    if not isinstance(value, kind):
+        raise BadInput(f"{where}: {what} expected, got {shown(value)}")
+    return value
+
+
+def _dataclass(kind: Any, value: Any, where: str, bounds: Mapping[type, Between], extra: bool) -> Any:
+    given = _as(dict, value, where, "a mapping")
+    unknown = sorted(set(given) - set(kinds(kind)))
+    if unknown and not extra:
+        raise BadInput(f"{where}: {shown(unknown[0])} is not known")
+    members = {}
+    for field in fields(kind):
+        needed = field.default is MISSING and field.default_factory is MISSING
+        if given.get(field.name) is None:
+            if needed:
+                raise BadInput(f"{where}: no {field.name}")
+            continue
+        members[field.name] = checked(
+            kinds(kind)[field.name], given[field.name], f"{where}: {field.name}", bounds, extra
+        )
+    return kind(**members)
