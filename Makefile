@@ -22,8 +22,11 @@ $(READY): pyproject.toml constraints.txt
 demo: $(READY)
 	$(BIN)/python scripts/demo.py
 
+# a file's tests stay together: they share scenes and removals
+SIDE_BY_SIDE := -n 2 --dist loadfile
+
 test: $(READY)
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(SIDE_BY_SIDE)
 
 # property tests at random, with five times as many examples
 test-all: export HYPOTHESIS_PROFILE = thorough

@@ -83,7 +83,9 @@ def shell(folder: Path, out: str) -> bytes:
     return Path(given[3]).read_bytes()
 
 
-@pytest.mark.parametrize("up", [None, *splats.UP_AXES], ids=str)
+@pytest.mark.parametrize(
+    "up", [pytest.param(up, marks=[pytest.mark.slow] * (up != "Y_UP")) for up in (None, *splats.UP_AXES)], ids=str
+)
 def test_blender_and_the_shell_give_the_same_bytes(folder: Path, up: str | None) -> None:
     """From the same numbers, also where the object stands upright in Blender and not in its file."""
     write_transforms(folder / "transforms.json", cameras()[::-1])  # views keep the file's order

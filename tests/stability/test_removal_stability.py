@@ -81,7 +81,7 @@ CASES: dict[str, tuple[Callable[[], RemovalResult], Callable[[], AbstractContext
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[pytest.mark.slow] * (k % 2)) for k, c in enumerate(CASES)])
 def test_nothing_explodes(case: str) -> None:
     work, wrong, loss = CASES[case]
     with wrong():

@@ -77,7 +77,9 @@ def test_the_light_is_found_and_its_shadow_goes(name: str) -> None:
     assert before < -0.3 and abs(after) < 0.2 * abs(before)
 
 
-@pytest.mark.parametrize("paint", [plain, floor_colours, tiles, rug, stain])
+@pytest.mark.parametrize(
+    "paint", [*(pytest.param(p, marks=pytest.mark.slow) for p in (plain, floor_colours, tiles)), rug, stain]
+)
 def test_where_the_object_casts_none_no_shadow_is_found(paint) -> None:  # type: ignore[no-untyped-def]
     scene = make_scene(paint.__name__, [], paint, casts=False)
     result = removed(scene)
