@@ -22,7 +22,7 @@ from gimp3d import commands, pipeline
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
-from gimp3d.job import RemovalJob
+from gimp3d.job import RemovalJob, save_job
 from gimp3d.pipeline import RemovalResult, RemovalSettings
 from gimp3d.priors.calls import Call
 from gimp3d.priors.inpaint import inpaint_reference, painter
@@ -258,9 +258,10 @@ def test_what_cannot_work_is_refused_before_the_work_begins(
 def test_a_job_cannot_allow_itself_the_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It may come from somebody else; who runs it decides."""
     folder = write_scene(tmp_path, 2)
-    job = {"version": 1, "scene": "scene.ply", "cameras": "transforms.json", "roi": "roi.json", "out": "out.ply"}
-    job |= {"images": "none", "inpaint": "http://192.0.2.7:8188"}
-    (folder / "job.json").write_text(json.dumps(job))
+    paths = {"scene": "scene.ply", "cameras": "transforms.json", "roi": "roi.json", "out": "out.ply"}
+    paths = {name: str(folder / path) for name, path in paths.items()}
+    save_job(folder, RemovalJob(**paths, images="none", inpaint="http://192.0.2.7:8188"))
+    job = json.loads((folder / "job.json").read_text())
     assert main(["remove", "--job", str(folder), "--progress", "none"]) == 2
     assert "192.0.2.7 is not this machine" in capsys.readouterr().err
     (folder / "job.json").write_text(json.dumps({**job, "allow_network": True}))

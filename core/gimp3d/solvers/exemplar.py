@@ -85,8 +85,8 @@ def complete_picture(
         if (regular == hole).all():
             return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
         hole = hole & ~regular
-    reach = np.ones((2 * settings.patch + 1,) * 2, np.uint8)
-    hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), reach) > 0))
+    patch = np.ones((settings.patch,) * 2, np.uint8)
+    hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), patch) > 0))
     unknown = unknown & ~hole
     if surface is not None:  # what is filled is mixed with nothing
         surface = surface._replace(clear=surface.clear | hole)
