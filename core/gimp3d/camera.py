@@ -48,7 +48,7 @@ class Camera:
     distortion: Distortion | None = None
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
+        if self.width < 0 or self.height < 0:  # the window of a view may be empty
             raise ValueError(f"camera {self.id}: a picture of {self.width}×{self.height} pixels")
         if self.viewmat.shape != (4, 4) or not np.isfinite(self.viewmat).all():
             raise ValueError(f"camera {self.id}: viewmat must be 4×4 finite numbers")

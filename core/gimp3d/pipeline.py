@@ -265,6 +265,9 @@ def remove_object(
         progress("read", 0, 1, notice)
     photos = {v.camera.id: v.image for v in views}
     cameras = [v.camera for v in views]
+    for camera in cameras:
+        if camera.width < 1 or camera.height < 1:
+            raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
     masks = run("masks", lambda: find_masks(scene, region, cameras, settings.masks, progress, photos, extra_masks))
     run.warnings += masks.warnings
     region = masks.grown(region)

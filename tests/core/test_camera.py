@@ -65,7 +65,7 @@ def test_quaternions_and_matrices_invert_each_other(quat) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"width": 0}, {"height": -1}, {"viewmat": np.full((4, 4), np.nan)}, {"viewmat": np.eye(3)}, {"fx": np.inf}],
+    [{"width": -1}, {"height": -1}, {"viewmat": np.full((4, 4), np.nan)}, {"viewmat": np.eye(3)}, {"fx": np.inf}],
 )
 def test_a_camera_that_no_picture_can_have_is_refused(wrong: dict[str, Any]) -> None:
     good = Camera("a", 4, 3, 5.0, 5.0, 2.0, 1.5, np.eye(4))

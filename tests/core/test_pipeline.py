@@ -247,3 +247,9 @@ def test_a_chart_that_there_is_not_is_refused(reference: str, count: int, words:
 def test_views_are_no_charts() -> None:
     for name in (None, "view", "chart", "chart:", "chart:one", "my/chart:1"):
         assert _named_chart(name, (), PRESETS["paper"]) is None
+
+
+def test_a_view_of_no_pixels_is_refused() -> None:
+    views = [View(replace(cameras(1)[0], width=0), np.zeros((96, 0, 3), np.uint8))]
+    with pytest.raises(BadInput, match="pixels"):
+        remove_object(scene(), views, REGION)

@@ -106,3 +106,9 @@ def test_windows_of_what_lies_behind_the_camera() -> None:
     g.means[:] = camera.centre - 5 * camera.forward
     rows, cols = touched_window(g, camera)
     assert (rows.stop - rows.start) * (cols.stop - cols.start) == 1
+
+
+def test_a_window_of_a_view_may_be_empty() -> None:
+    """A view of which nothing is painted is a part of no pixels, and no fault."""
+    part = cropped(cameras(1)[0], (slice(3, 3), slice(5, 5)))
+    assert (part.width, part.height) == (0, 0)
