@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-fill bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension \
+	bench-harmonics bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension \
 	screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -139,6 +139,9 @@ bench-inpaint: $(READY) $(OTHERS)/.ready
 # the built-in fill beside the true picture given, and beside other programs on pictures with structure: ten minutes
 bench-fill: $(READY) $(OTHERS)/.ready
 	$(BIN)/python scripts/bench_fill.py $(DATA) --others $(OTHERS)/bin/python
+
+bench-fill-rules: $(READY)
+	$(BIN)/python scripts/fill_ablation.py $(DATA)
 
 extension: $(READY)
 	$(BIN)/python scripts/build_extension.py
