@@ -22,6 +22,7 @@ from depth_scenes import PLACES, RELIEFS, place, prior_of, relief
 
 from gimp3d.box import read_region
 from gimp3d.camera import Camera
+from gimp3d.compute.threads import parallel_map
 from gimp3d.errors import IllPosed
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras
@@ -34,7 +35,6 @@ from gimp3d.stages.depth import DepthSettings, complete_depth, complete_disparit
 from gimp3d.stages.layers import distance_to
 from gimp3d.stages.masks import ViewMasks, find_masks
 from gimp3d.stages.reference import disparity_of, rim
-from gimp3d.threads import parallel_map
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = DepthSettings()

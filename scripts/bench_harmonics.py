@@ -25,10 +25,10 @@ from bench_raster import Watch, best_of, cost, machine, say, write
 from harmonics_report import accuracy_chart, markdown, stability_chart
 from materials import MATERIALS, RULES, errors_of, simulate
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.evaluate import benchmark
 from gimp3d.pipeline import PRESETS
 from gimp3d.solvers.harmonics import HarmonicsSettings, Observations, fit_harmonics, sh_basis
-from gimp3d.threads import set_thread_count
 
 ROOT = Path(__file__).resolve().parents[1]
 RIDGE = 0.01  # of the fits that are the same for all

@@ -32,11 +32,11 @@ from chart import FAINT, Axis, Series, drawn, frame, page, text
 from photographs import REPETITIONS, SHARE, SLOW_S, blob, filled_by, photographs
 from raster_report import table
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.evaluate.metrics import score
 from gimp3d.io.images import write_png
 from gimp3d.priors.inpaint import inpaint_reference
 from gimp3d.solvers.exemplar import complete_picture
-from gimp3d.threads import set_thread_count
 
 OURS, RIVALS = "gimp3d exemplar", ("PyPatchMatch, radius 2", "PyPatchMatch, radius 3")
 OPENCV = {"cv2 Telea": "telea", "cv2 NS": "ns", "xphoto SHIFTMAP": "shiftmap", "xphoto FSR fast": "fsr"}

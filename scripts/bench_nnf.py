@@ -31,9 +31,9 @@ from classic_patchmatch import RADIUS, classic, pyramid
 from photographs import SHARE, blob, photographs
 from raster_report import table
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.solvers.patches import lay_out
 from gimp3d.solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field, patch_centres
-from gimp3d.threads import set_thread_count
 
 QUERIES = 500
 CHUNK = 65536  # source patches compared at once

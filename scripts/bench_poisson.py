@@ -37,8 +37,8 @@ import scipy.sparse.linalg
 from bench_raster import HERE, ROOT, machine, say, write
 from poisson_report import draw_chart, markdown
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.solvers.poisson import PoissonSettings, solve_hole
-from gimp3d.threads import set_thread_count
 
 SIZES = {"480p": (480, 854), "1080p": (1080, 1920), "4K": (2160, 3840)}
 TOLERANCES = (1e-3, 1e-6, 1e-9)

@@ -34,11 +34,11 @@ from chart import in_words
 from raster_report import draw_chart, markdown, shown
 
 from gimp3d.camera import Camera
+from gimp3d.compute.simd import fma16, splat16, store16
+from gimp3d.compute.threads import available_cores, set_thread_count
 from gimp3d.gaussians import Gaussians
 from gimp3d.job import write_atomically
 from gimp3d.raster import PictureGradients, backward, contributions, cpu, pixel_region, render, trace
-from gimp3d.raster.vec16 import fma16, splat16, store16
-from gimp3d.threads import available_cores, set_thread_count
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent

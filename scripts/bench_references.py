@@ -26,11 +26,11 @@ from references_report import FILLED, GIVEN, draw_chart, markdown
 from surface_scenes import Scene, read_scene
 
 from gimp3d.camera import Camera
+from gimp3d.compute.threads import available_cores, set_thread_count
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.io.images import read_image
 from gimp3d.pipeline import PRESETS, RemovalSettings, View, remove_object, render_bytes
-from gimp3d.threads import available_cores, set_thread_count
 
 SCENES = ("desk", "corner", "gloss", "rocks")
 MODES = ("balanced", "paper")

@@ -23,10 +23,10 @@ import scipy.sparse.linalg
 from bench_raster import say
 from made_room import Shot, loaders, reference_of, shoot
 
+from gimp3d.compute.threads import available_cores
 from gimp3d.solvers.poisson import PoissonSolution, solve_poisson
 from gimp3d.stages import propagate as stage
 from gimp3d.stages.propagate import Reference, propagate
-from gimp3d.threads import available_cores
 
 Size = tuple[int, int]
 SHOTS = 6  # different views; more views repeat them

@@ -381,9 +381,9 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
 
 
 def _bench(given: Namespace, shown: Reporter) -> None:
+    from .compute.threads import set_thread_count
     from .evaluate.benchmark import run_benchmark, table
     from .pipeline import PRESETS
-    from .threads import set_thread_count
 
     presets = _names(given.presets) or ()
     unknown = [p for p in presets if p not in PRESETS]

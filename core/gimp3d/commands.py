@@ -16,6 +16,8 @@ import numpy as np
 from . import __version__
 from .box import read_region
 from .camera import Camera, output_name
+from .compute.jit import announce_compilation
+from .compute.threads import parallel_map, set_thread_count
 from .errors import BadInput
 from .files import is_stream, sweep, try_target, write_atomically
 from .frame import Frame, frame_of
@@ -24,7 +26,6 @@ from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
-from .jit import announce_compilation
 from .job import SHADOWS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
@@ -46,7 +47,6 @@ from .schema import within
 from .stages.charts import Chart, chart_number
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
-from .threads import parallel_map, set_thread_count
 
 PASSES = ("rgb", "alpha", "depth", "normal")
 

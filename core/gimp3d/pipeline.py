@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import scipy.ndimage
 
-from . import buffers
 from .box import Box, Region
 from .camera import Camera
+from .compute import buffers
+from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
 from .priors.calls import Call
@@ -71,7 +72,6 @@ from .stages.shadow import Shadow, find_shadow, marked_shadow
 from .stages.verdict import Verdict, judge
 from .stages.view_refinement import RefinedView, ViewRefinement, ViewToRefine, refine_views
 from .stages.witness import Witness
-from .threads import parallel_map
 
 R = TypeVar("R")
 SAME = 0.01  # relative z within which two references show the same surface

@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..compute.threads import thread_count
 from ..errors import BadInput
-from ..threads import thread_count
 from .appearance import Painter
 from .calls import Call, waited
 from .networks import as_picture

@@ -12,9 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 from numba import float32, float64, int64, uint64
 
-from ..buffers import empty, zeros
-from ..jit import exact_kernel, inline_kernel
-from ..threads import parallel_map, run_ranges, thread_count
+from ..compute.buffers import empty, zeros
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.simd import (
+    floor16,
+    fma16,
+    load1,
+    lowest_bit,
+    max16,
+    min16,
+    prefetch,
+    ramp16,
+    spans_to_bits,
+    splat16,
+    sqrt16,
+    where_greater,
+)
+from ..compute.threads import parallel_map, run_ranges, thread_count
 from .project import (
     BOUND_X,
     BOUND_Y,
@@ -28,20 +42,6 @@ from .project import (
     WHITEN_XY,
     WHITEN_YY,
     ZERO,
-)
-from .vec16 import (
-    floor16,
-    fma16,
-    load1,
-    lowest_bit,
-    max16,
-    min16,
-    prefetch,
-    ramp16,
-    spans_to_bits,
-    splat16,
-    sqrt16,
-    where_greater,
 )
 
 AHEAD = 16  # rows to prefetch: in depth order each is a cache miss

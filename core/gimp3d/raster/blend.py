@@ -10,7 +10,28 @@ from __future__ import annotations
 import numpy as np
 from numba import float32, int64, uint64
 
-from ..jit import exact_kernel, inline_kernel
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.simd import (
+    any_between,
+    columns16,
+    exp2_16,
+    fma16,
+    highest16,
+    load1,
+    load16,
+    lowest_bit,
+    max16,
+    min16,
+    prefetch,
+    rows16,
+    splat16,
+    sqrt16,
+    store16,
+    store_block,
+    store_block3,
+    sum16,
+    where_greater,
+)
 from .bin import ONE, cover_mask
 from .project import (
     A_X,
@@ -37,27 +58,6 @@ from .project import (
     WHITEN_XY,
     WHITEN_YY,
     ZERO,
-)
-from .vec16 import (
-    any_between,
-    columns16,
-    exp2_16,
-    fma16,
-    highest16,
-    load1,
-    load16,
-    lowest_bit,
-    max16,
-    min16,
-    prefetch,
-    rows16,
-    splat16,
-    sqrt16,
-    store16,
-    store_block,
-    store_block3,
-    sum16,
-    where_greater,
 )
 
 BLOCK = 4  # px, side of a block

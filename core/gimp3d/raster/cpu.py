@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..buffers import empty, zeros
 from ..camera import Camera
+from ..compute.buffers import empty, zeros
+from ..compute.jit import announce_compilation
+from ..compute.threads import parallel_map, run_ranges, thread_count
 from ..gaussians import Gaussians
-from ..jit import announce_compilation
-from ..threads import parallel_map, run_ranges, thread_count
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
 from .project import (

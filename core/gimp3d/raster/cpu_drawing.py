@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..buffers import zeros
 from ..camera import Camera
+from ..compute.buffers import zeros
+from ..compute.jit import exact_kernel
+from ..compute.threads import run_ranges
 from ..gaussians import Gaussians
-from ..jit import exact_kernel
-from ..threads import run_ranges
 from . import cpu
 from .bin import TileLists, tile_lists
 from .project import BLUE, RED

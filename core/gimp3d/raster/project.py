@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numba import float32, float64, int32, int64
 
-from ..jit import exact_kernel, inline_kernel
-from .vec16 import bits_of, float_of, load1, store1
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.simd import bits_of, float_of, load1, store1
 
 TILE = 32  # px, side of a tile
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..buffers import empty
 from ..camera import Camera
+from ..compute.buffers import empty
+from ..compute.jit import exact_kernel
 from ..gaussians import Gaussians
-from ..jit import exact_kernel
 from . import cpu
 from .bin import TileLists, tile_lists
 from .blend import TILE_STATE, blend_range

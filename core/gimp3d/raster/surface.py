@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import float64, int64
 
-from ..jit import exact_kernel
+from ..compute.jit import exact_kernel
 from .project import exp64, rotation
 
 REACH = 3.0  # standard deviations from its centre, along z, within which a Gaussian is met

@@ -11,7 +11,27 @@ from __future__ import annotations
 import numpy as np
 from numba import float32, int64, uint64
 
-from ..jit import exact_kernel, inline_kernel
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.simd import (
+    columns16,
+    fma16,
+    load1,
+    load16,
+    load_block,
+    load_block_x,
+    load_block_y,
+    load_block_z,
+    lowest_bit,
+    max16,
+    prefetch,
+    rows16,
+    splat16,
+    sqrt16,
+    store16,
+    sums16,
+    where_equal,
+    where_greater,
+)
 from .bin import ONE
 from .blend import (
     BLOCK,
@@ -62,26 +82,6 @@ from .project import (
     WHITEN_XY,
     WHITEN_YY,
     ZERO,
-)
-from .vec16 import (
-    columns16,
-    fma16,
-    load1,
-    load16,
-    load_block,
-    load_block_x,
-    load_block_y,
-    load_block_z,
-    lowest_bit,
-    max16,
-    prefetch,
-    rows16,
-    splat16,
-    sqrt16,
-    store16,
-    sums16,
-    where_equal,
-    where_greater,
 )
 
 RECORD = 16

@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numba import float32, float64
 
-from ..jit import exact_kernel, inline_kernel
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.simd import load1, load16, prefetch, splat16, store1, store16
 from .project import (
     BASIS_PLANES,
     BLUE,
@@ -67,7 +68,6 @@ from .unblend import (
     P_YY,
     RECORD,
 )
-from .vec16 import load1, load16, prefetch, splat16, store1, store16
 
 SIX, EIGHT = np.float32(6), np.float32(8)
 AHEAD = 16  # Gaussians whose records to prefetch: tiles left them all over the memory

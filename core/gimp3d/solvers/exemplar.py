@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ..jit import kernel
-from ..threads import run_ranges
+from ..compute.jit import kernel
+from ..compute.threads import run_ranges
 from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numba import float32, int64
 
-from ..jit import inline_kernel, kernel
-from ..raster.vec16 import fma16, load16, splat16, sum16
+from ..compute.jit import inline_kernel, kernel
+from ..compute.simd import fma16, load16, splat16, sum16
 from .patches import lay_out
 from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
 

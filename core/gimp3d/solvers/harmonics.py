@@ -15,12 +15,12 @@ from enum import IntEnum
 import numpy as np
 from numba import float32, int64
 
+from ..compute.jit import exact_kernel
+from ..compute.simd import exp2_16, fma16, load1, load16, max16, min16, splat16, sqrt16, store1, store16, where_greater
+from ..compute.threads import run_ranges
 from ..errors import BadInput
 from ..gaussians import SH_C0
-from ..jit import exact_kernel
-from ..raster.vec16 import exp2_16, fma16, load1, load16, max16, min16, splat16, sqrt16, store1, store16, where_greater
 from ..sh import C1, C2, C3, sh_basis
-from ..threads import run_ranges
 
 HIGHEST = 3  # degree of 3DGS's files
 

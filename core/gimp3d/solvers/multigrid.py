@@ -30,8 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import buffers
-from ..jit import inline_kernel, kernel
+from ..compute import buffers
+from ..compute.jit import inline_kernel, kernel
 
 DIGITS = 5e-6  # by which float32 may lower the residual before it is found anew
 COARSEST = 16  # nodes of the last grid, solved directly

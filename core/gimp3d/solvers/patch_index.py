@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..jit import inline_kernel, kernel
-from ..raster.vec16 import LANES
-from ..threads import parallel_map
+from ..compute.jit import inline_kernel, kernel
+from ..compute.simd import LANES
+from ..compute.threads import parallel_map
 from .patches import Components, Patches, coordinates, main_components
 
 NOWHERE = 1e18  # coordinate of the last block's empty places

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numba import float32
 
-from ..jit import kernel
-from ..raster.vec16 import LANES, fma16, load1, load16, splat16, store16
-from ..threads import run_ranges
+from ..compute.jit import kernel
+from ..compute.simd import LANES, fma16, load1, load16, splat16, store16
+from ..compute.threads import run_ranges
 
 SAMPLES = 4096  # patches that the main components are found from
 BOUND = 0.9999  # by which coordinates are shortened: rounding must not lift their distance above the patches'

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numba import float32, int64, uint32
 
-from ..jit import inline_kernel, kernel
-from ..raster.vec16 import any_between, fma16, load1, load16, splat16, store16, sum16
+from ..compute.jit import inline_kernel, kernel
+from ..compute.simd import any_between, fma16, load1, load16, splat16, store16, sum16
+from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
-from ..threads import parallel_map
 from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
 from .patches import Patches, coordinates, lay_out
 from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports

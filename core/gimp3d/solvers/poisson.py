@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ..jit import exact_kernel, kernel
+from ..compute.jit import exact_kernel, kernel
 from .multigrid import Multigrid, places_of
 
 HOLE, KNOWN = 1, 16  # kinds of pixels: a sum over the four neighbours counts both

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..threads import parallel_map
+from ..compute.threads import parallel_map
 
 SIDE = 96  # px: pictures are shrunk to this to find motions in
 ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numba import float32
 
-from ..jit import exact_kernel
-from ..threads import parallel_map, run_ranges
+from ..compute.jit import exact_kernel
+from ..compute.threads import parallel_map, run_ranges
 
 WINDOW = 14  # px: half the window that planes are fitted to
 STRIP = 256  # rows that are fitted at once; results do not depend on it

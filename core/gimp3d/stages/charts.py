@@ -19,9 +19,9 @@ import scipy.ndimage
 
 from ..box import Region, in_region
 from ..camera import Camera
+from ..compute.threads import parallel_map, run_ranges
 from ..schema import AtLeastOne
 from ..solvers.thin_plate import thin_plate
-from ..threads import parallel_map, run_ranges
 from .footprint import shows_object
 from .masks import ViewMasks, sees
 from .mosaic import mosaic

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from ..box import Region
+from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
-from ..threads import parallel_map
 from .charts import Chart, Hits, extent, first_hits
 from .masks import ViewMasks, sees
 from .outline import window_mask

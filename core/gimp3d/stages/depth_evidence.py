@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
-from ..jit import exact_kernel
+from ..compute.jit import exact_kernel
+from ..compute.threads import at_once, parallel_map
 from ..schema import AtLeastOne, Positive, Share
-from ..threads import at_once, parallel_map
 from .layers import steps
 from .masks import ViewMasks
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..box import Region
 from ..camera import Camera
-from ..threads import parallel_map
+from ..compute.threads import parallel_map
 from .charts import (
     PARALLEL,
     ChartSettings,

@@ -9,11 +9,11 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
+from ..compute.threads import parallel_map
 from ..gaussians import SH_C0, Gaussians
 from ..raster import PixelRegion, Window, label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
-from ..threads import parallel_map
 from .charts import Hits, first_hits
 from .ground import Ground
 from .outline import window_round

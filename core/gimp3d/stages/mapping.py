@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..camera import Camera
-from ..jit import exact_kernel
+from ..compute.jit import exact_kernel
+from ..compute.threads import run_ranges
 from ..schema import Share, Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
-from ..threads import run_ranges
 from .reference import disparity_of
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e

@@ -13,12 +13,12 @@ import scipy.sparse.csgraph
 
 from ..box import Region, in_region
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import drawing, render, touched_window
 from ..schema import Positive, Share
-from ..threads import parallel_map
 from .growth import NOTHING, Growth, GrowthSettings, find_growth
 from .outline import (
     Window,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ..jit import exact_kernel, inline_kernel
-from ..threads import parallel_map, run_ranges
+from ..compute.jit import exact_kernel, inline_kernel
+from ..compute.threads import parallel_map, run_ranges
 from .witness import Says, Witness, texture
 
 SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import norm, qmc
 
+from ..compute.jit import kernel
+from ..compute.threads import run_ranges
 from ..gaussians import Gaussians, quats_to_matrices
-from ..jit import kernel
-from ..threads import run_ranges
 from .charts import Plane
 
 CELLS = 40  # along the longest side

@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
+from ..compute.jit import inline_kernel, kernel
+from ..compute.threads import at_once, parallel_map, run_ranges
 from ..errors import BadInput
-from ..jit import inline_kernel, kernel
 from ..progress import Progress, silent
 from ..schema import AtLeastOne, Share
 from ..solvers.colours import NO_CHANGE, ColourChange, biweight, exposure_gain, learn_change
 from ..solvers.poisson import solve_poisson
-from ..threads import at_once, parallel_map, run_ranges
 
 TRANSFERS = ("learned", "sample", "none")
 BLENDS = ("band", "rim")

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..schema import AtLeastOne, Many, Share
 from ..solvers.thin_plate import ThinPlateSettings
-from ..threads import parallel_map
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks, sees
 

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..progress import Progress, silent
 from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_region
 from ..schema import AtLeastOne, Between, Share
-from ..threads import parallel_map
 from .propagate import Rule
 
 V = TypeVar("V")

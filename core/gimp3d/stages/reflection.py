@@ -13,10 +13,10 @@ from scipy.optimize import nnls
 
 from ..box import Region
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..raster import render
 from ..srgb import decoded, linear
-from ..threads import parallel_map
 from .charts import Plane, extent
 from .ground import ROUGH, Ground
 from .light_search import EARNS, FITS, places_elsewhere

@@ -11,13 +11,13 @@ from typing import Annotated
 import numpy as np
 
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import AtLeastOne, Between, Positive, Share
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
-from ..threads import parallel_map
 from .masks import sees
 from .outline import cropped, window_mask
 from .propagate import PaintedView, Rule

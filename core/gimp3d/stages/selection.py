@@ -13,10 +13,10 @@ from scipy.special import ndtri
 
 from ..box import Region, in_region
 from ..camera import Camera
+from ..compute.threads import parallel_map, run_ranges
 from ..gaussians import Gaussians, quats_to_matrices
 from ..raster import label_weights
 from ..schema import Share
-from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 from .surroundings import Surroundings, SurroundingsSettings
 

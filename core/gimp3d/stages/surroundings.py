@@ -16,9 +16,9 @@ import scipy.ndimage
 
 from ..box import Box, Region, in_region
 from ..camera import Camera
-from ..jit import exact_kernel
+from ..compute.jit import exact_kernel
+from ..compute.threads import parallel_map, run_ranges
 from ..schema import AtLeastOne, Degrees, Many, Positive, Share
-from ..threads import parallel_map, run_ranges
 from .outline import box_window, surface_points
 
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera

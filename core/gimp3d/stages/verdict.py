@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
+from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..raster import drawing, render
 from ..solvers.variogram import at_lag, foretell, variogram
-from ..threads import parallel_map
 from .charts import Chart, Hits
 from .masks import ViewMasks, sees
 from .propagate import Reference

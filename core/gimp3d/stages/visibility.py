@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..camera import Camera
-from ..jit import exact_kernel
-from ..threads import parallel_map, run_ranges
+from ..compute.jit import exact_kernel
+from ..compute.threads import parallel_map, run_ranges
 from .outline import Window, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's

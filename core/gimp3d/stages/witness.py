@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
-from ..jit import exact_kernel, kernel
+from ..compute.jit import exact_kernel, kernel
+from ..compute.threads import parallel_map, run_ranges
 from ..raster import Window
-from ..threads import parallel_map, run_ranges
 from .outline import cropped
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from pictures import disc, error, holed, refuse, scenery
 from property_tests import examples
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import IllPosed
 from gimp3d.priors.inpaint import PROVIDERS, inpaint_reference
-from gimp3d.threads import set_thread_count
 
 
 @pytest.fixture(autouse=True)

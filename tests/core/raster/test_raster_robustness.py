@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from property_tests import examples
 from test_raster_render import CAMERA, one, random_scene
 
-from gimp3d import threads
 from gimp3d.camera import Camera
+from gimp3d.compute import threads
 from gimp3d.gaussians import Gaussians, quats_to_matrices
 from gimp3d.raster import (
     PASSES,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_raster_render import CAMERA, one, random_scene
 
-from gimp3d import threads
+from gimp3d.compute import threads
 from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices
 from gimp3d.raster import RasterSettings, render, surface_depth
 

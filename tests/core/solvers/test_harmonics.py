@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from property_tests import examples
 from scipy.special import sph_harm_y
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, quats_to_matrices
 from gimp3d.solvers.harmonics import (
@@ -23,7 +24,6 @@ from gimp3d.solvers.harmonics import (
     rotate_sh,
     sh_basis,
 )
-from gimp3d.threads import set_thread_count
 
 seeds = st.integers(0, 999)
 

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
 
-from gimp3d.jit import kernel
+from gimp3d.compute.jit import kernel
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.solvers.patch_index import Tree, index_patches, leaf_of
 from gimp3d.solvers.patches import coordinates, lay_out
-from gimp3d.threads import set_thread_count
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.solvers.patchmatch import (
     NearestNeighbourField,
     PatchMatchSettings,
@@ -17,7 +18,6 @@ from gimp3d.solvers.patchmatch import (
     patch_centres,
     upsampled,
 )
-from gimp3d.threads import set_thread_count
 
 APPEARANCE_ONLY = PatchMatchSettings(coherence=0.0)
 

@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
 
+from gimp3d.compute.threads import parallel_map, set_thread_count
 from gimp3d.solvers.poisson import PoissonSettings, solve_hole, solve_poisson
-from gimp3d.threads import parallel_map, set_thread_count
 
 EXACT = PoissonSettings(tolerance=1e-10)
 SINGLE = PoissonSettings(tolerance=1e-10, precision="float32")

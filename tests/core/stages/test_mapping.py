@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gimp3d.camera import Camera
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.stages.mapping import MappingSettings, mapping_field, source_visibility
-from gimp3d.threads import set_thread_count
 
 View = tuple[Camera, np.ndarray, np.ndarray]
 

@@ -15,6 +15,7 @@ from scenes import BLOCK, REGION, block, cameras, discs, floor, scene, truth
 
 from gimp3d.box import Box, read_region
 from gimp3d.camera import Camera
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import load_view, read_mask
@@ -28,7 +29,6 @@ from gimp3d.stages import masks as stage
 from gimp3d.stages import selection
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks, sees
 from gimp3d.stages.selection import Fate, SelectionSettings
-from gimp3d.threads import set_thread_count
 
 RIM = np.ones((3, 3), np.uint8)  # a 1-px rim on every side
 

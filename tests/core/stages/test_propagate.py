@@ -19,6 +19,7 @@ from property_tests import examples
 from scenes import cameras, truth
 
 from gimp3d.camera import Camera
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
@@ -36,7 +37,6 @@ from gimp3d.stages.propagate import (
     propagate,
     smooth_depth,
 )
-from gimp3d.threads import set_thread_count
 
 HOLE = (40, 60, 40, 65)  # rows and columns of T_0
 SHIFT = 30  # columns from a hole pixel to its source

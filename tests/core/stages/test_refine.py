@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import cameras, floor, truth
 
+from gimp3d.compute.threads import set_thread_count
 from gimp3d.evaluate.metrics import ssim_map
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
@@ -16,7 +17,6 @@ from gimp3d.stages import refine
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.refine import Observation, RefineSettings, observed, refine_gaussians
 from gimp3d.stages.seed import seed_gaussians
-from gimp3d.threads import set_thread_count
 
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh")
 QUICK = RefineSettings(steps=40, check=10)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gimp3d import buffers
+from gimp3d.compute import buffers
 
 LARGE = buffers.SMALLEST  # bytes
 

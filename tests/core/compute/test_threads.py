@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from gimp3d.threads import parallel_map, run_ranges, set_thread_count, thread_count
+from gimp3d.compute.threads import parallel_map, run_ranges, set_thread_count, thread_count
 
 
 def test_ranges_cover_everything_once() -> None:
