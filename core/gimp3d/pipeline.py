@@ -18,6 +18,7 @@ from .compute import buffers
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
+from .geometry import SAME_DEPTH
 from .priors.calls import Call
 from .priors.inpaint import Appearance, check_provider, inpaint_reference, painter, paste_picture
 from .priors.monodepth import check_depth_prior, depth_prior, looks
@@ -747,7 +748,7 @@ def _fill_from_chart(
 
 def _rough(charts: Sequence[Chart], settings: RemovalSettings) -> bool:
     """The views' drawn surfaces scatter about the charts by more than a z-test allows."""
-    return any(c.scatter > settings.propagate.depth_tolerance for c in charts)
+    return any(c.scatter > SAME_DEPTH for c in charts)
 
 
 def _on_charts(v: ViewMasks, so_far: _SoFar, charts: Sequence[Chart]) -> ViewToPaint:
@@ -765,7 +766,7 @@ def _as_drawn(v: ViewMasks, so_far: _SoFar, with_seeds: Gaussians, settings: Rem
     """The view with the depth of its splats, the new ones among them."""
     name, after = v.camera.id, np.zeros_like(v.depth_before)
     if v.target.any():
-        window = window_mask(near_hole(v.target, settings.propagate), v.camera)
+        window = window_mask(near_hole(v.target), v.camera)
         after = surface_depth(with_seeds, v.camera, pixels=window)[0]
     photo, painted = so_far.photos[name], so_far.painted[name]
     return ViewToPaint(v.camera, photo, painted, v.silhouette, v.target, v.depth_before, after)
