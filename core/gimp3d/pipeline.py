@@ -118,9 +118,7 @@ PRESETS: dict[str, RemovalSettings] = {
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(
-            largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
-        ),
+        seed=SeedSettings(largest=1, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         refine=RefineSettings(steps=3000, patience=120),
         shadow="off",
         use_evidence=False,

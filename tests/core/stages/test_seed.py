@@ -331,20 +331,6 @@ def test_the_papers_constant_lacks_what_3dgs_adds() -> None:
     np.testing.assert_allclose(ours.sh[:, 0], seeds.sh[:, 0], atol=1e-6)  # float32, there and back
 
 
-def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
-    views, painted = _hole_and_truth()
-    view = views[1]
-    seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
-    below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
-    seen_from = [v.camera for v in views]
-    new = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
-    assert len(new) < 0.1 * len(below)  # the floor hides them
-    everything = settle_gaussians(
-        truth(), below, view.camera, seen_from, painted, SeedSettings(needed=0, corrections=0, sink=0)
-    )
-    assert np.array_equal(everything.means, below.means)
-
-
 def test_a_patch_size_that_cannot_be_halved_is_refused() -> None:
     camera = cameras(9)[1]
     with pytest.raises(BadInput, match="power of two"):
