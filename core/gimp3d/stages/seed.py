@@ -14,15 +14,12 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
-from ..geometry import SAME_DEPTH
+from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals
 from ..raster import PictureGradients, PixelRegion, RasterSettings, pixel_region
 from ..schema import Between, Positive
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
-from .masks import sees
-from .outline import cropped
 from .propagate import PaintedView, Rule
-from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
 SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all
@@ -245,7 +242,7 @@ def colour_gaussians(
         seen = parallel_map(lambda pair: _seen_in(means, *pair), zip(views, painted))
         colours = 0.5 + SH_C0 * sh[:, 0].astype(np.float64)
         observations = gather_observations(len(seeds), seen)
-        sh = fit_harmonics(colours, _towards(means, reference), observations, degree, settings.harmonics).sh
+        sh = fit_harmonics(colours, directions(means, reference), observations, degree, settings.harmonics).sh
     sh = pad_sh(sh, bands).copy()
     sh[:, 0] += (0.5 - settings.grey) / SH_C0
     return replace(seeds, sh=sh)
@@ -271,7 +268,7 @@ def settle_gaussians(
     looks = others[:: max(1, math.ceil(len(others) / LOOKS))]
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(partial(_colour_step, scene, new), looks)
-        towards = [_towards(new.means.astype(np.float64), view) for view, _ in looks]
+        towards = [directions(new.means.astype(np.float64), view) for view, _ in looks]
         change = _colour_change(steps, towards, min(settings.sh_degree, new.sh_degree), HOLD)
         sh = new.sh.copy()
         sh[:, : change.shape[1]] += change
@@ -341,10 +338,4 @@ def _seen_in(means: np.ndarray, view: Camera, paint: PaintedView) -> tuple[np.nd
     cols, rows = uv.astype(int).T
     own = np.isin(paint.rules[rows, cols], OWN_RULES)
     index = visible[own]
-    return index, _towards(means[index], view), paint.image[rows[own], cols[own]] / 255.0
-
-
-def _towards(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit directions from the camera to the points."""
-    towards = means - camera.centre
-    return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    return index, directions(means[index], view), paint.image[rows[own], cols[own]] / 255.0

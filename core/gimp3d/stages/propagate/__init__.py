@@ -15,9 +15,9 @@ import numpy as np
 
 from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
+from ...geometry import bounds, cropped
 from ...progress import Progress, silent
 from ...solvers.colours import NO_CHANGE
-from ..outline import cropped
 from .blend import blend_band, to_bytes
 from .paper import Lent, Mapped, blend_rim, lent_colours, sampled
 from .transfer import flat, learned_change
@@ -48,9 +48,7 @@ EVIDENCE = 0.006  # relative z within which the photo's own surface is the new o
 
 def near_hole(target: np.ndarray) -> tuple[slice, slice]:
     """Rows and columns of what is looked at when the target [H, W] bool is painted; empty if that is."""
-    if not target.any():
-        return slice(0, 0), slice(0, 0)
-    return _bounds(target, _reach(target))
+    return bounds(target, _reach(target))
 
 
 def _reach(target: np.ndarray) -> int:
@@ -126,7 +124,7 @@ def _painted(mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], settings: 
     else:
         blended = blend_band(base, raw, painted, photo, BAND * reach, depth, change.offset)
     rules[evidence] = Rule.EVIDENCE
-    rows, cols = _bounds(near.target, 0)
+    rows, cols = bounds(near.target)
     return PaintedView(
         view.camera.id,
         top + rows.start,
@@ -140,17 +138,9 @@ def _painted(mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], settings: 
 
 def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
     """The part of the view round its target, which is not empty, and where it begins."""
-    part = _bounds(view.target, margin)
+    part = bounds(view.target, margin)
     arrays = (getattr(view, f.name)[part] for f in fields(view) if f.name != "camera")
     return ViewToPaint(cropped(view.camera, part), *arrays), part[0].start, part[1].start
-
-
-def _bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Rows and columns that hold the mask, which is not empty, and a margin."""
-    there = (np.flatnonzero(mask.any(1 - axis)) for axis in (0, 1))
-    ends = zip(there, mask.shape)
-    rows, cols = (slice(max(0, int(x[0]) - margin), min(n, int(x[-1]) + margin + 1)) for x, n in ends)
-    return rows, cols
 
 
 def _same_surface(view: ViewToPaint) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import parallel_map, run_ranges
-from ...geometry import SAME_DEPTH
+from ...geometry import SAME_DEPTH, colours_at
 from ...solvers.colours import exposure_gain
 from ...solvers.poisson import solve_poisson
 from .blend import SEAM, SQUARE, to_bytes
@@ -141,20 +141,9 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
     points = reference.camera.unproject(
         np.stack([cols + 0.5, rows + 0.5], -1), mapped.picture.depth[rows, cols].astype(np.float64)
     )
-    x, y = (camera.project(points)[0].astype(np.float32) - 0.5).T.reshape(2, -1, 1)
     colours = np.zeros((len(seen), 3), np.float32)
-    if seen.any():
-        colours[seen] = _remap(view.image, x, y)
+    colours[seen] = colours_at(view.image, camera.project(points)[0])
     return Lent(camera, colours, seen, exposure_gain(reference.image[rows, cols], colours[seen]))
-
-
-def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """[N, 3] bilinear samples; OpenCV takes at most 32,767 rows at once."""
-    parts = [
-        cv2.remap(image, x[k : k + 32000], y[k : k + 32000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        for k in range(0, len(x), 32000)
-    ]
-    return np.concatenate(parts)
 
 
 def blend_rim(

@@ -14,14 +14,14 @@ import numpy as np
 from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import run_ranges
-from ...geometry import SAME_DEPTH
+from ...geometry import SAME_DEPTH, pack_camera, project, unproject
 from .types import Reference, ViewToPaint
 
 
 class Picture(NamedTuple):
     """A view as the kernels take it."""
 
-    camera: np.ndarray  # [16], see packed
+    camera: np.ndarray  # [18], see pack_camera
     depth: np.ndarray  # [H, W] float32
     image: np.ndarray  # [H, W, 3] uint8
     usable: np.ndarray  # [H, W] bool, pixels that show a photo's unhidden surface
@@ -34,7 +34,7 @@ def picture_of(view: ViewToPaint | Reference) -> Picture:
     else:
         depth, usable = view.depth_before, ~view.silhouette
     arrays = np.asarray(depth, np.float32), view.image, usable
-    return Picture(packed(view.camera), *(np.ascontiguousarray(a) for a in arrays))
+    return Picture(pack_camera(view.camera), *(np.ascontiguousarray(a) for a in arrays))
 
 
 @dataclass(frozen=True)
@@ -69,37 +69,12 @@ def warp_reference(
     rows, cols = np.nonzero(wanted)
     colours = np.zeros((*wanted.shape, 3), np.float32)
     u, v = np.full((2, *wanted.shape), np.nan)
-    run_ranges(_warp_range, len(rows), rows, cols, packed(camera), depth, reference, SAME_DEPTH, colours, u, v)
+    run_ranges(_warp_range, len(rows), rows, cols, pack_camera(camera), depth, reference, SAME_DEPTH, colours, u, v)
     return Warp(colours, u, v)
 
 
-def packed(camera: Camera) -> np.ndarray:
-    """Rotation (9), translation (3), fx fy cx cy as one float64 vector for the kernels."""
-    return np.concatenate([camera.R.ravel(), camera.t, [camera.fx, camera.fy, camera.cx, camera.cy]])
-
-
 @inline_kernel
-def unprojected(c, u, v, z):
-    """World coordinates of a pixel's point."""
-    x = (u - c[14]) / c[12] * z
-    y = (v - c[15]) / c[13] * z
-    a, b, d = x - c[9], y - c[10], z - c[11]
-    return c[0] * a + c[3] * b + c[6] * d, c[1] * a + c[4] * b + c[7] * d, c[2] * a + c[5] * b + c[8] * d
-
-
-@inline_kernel
-def projected(c, x, y, z):
-    """Pixel coordinates and depth of a point; far outside of any picture behind the camera."""
-    w = c[6] * x + c[7] * y + c[8] * z + c[11]
-    if w <= 1e-9:
-        return -1e9, -1e9, w
-    a = c[0] * x + c[1] * y + c[2] * z + c[9]
-    b = c[3] * x + c[4] * y + c[5] * z + c[10]
-    return c[12] * a / w + c[14], c[13] * b / w + c[15], w
-
-
-@inline_kernel
-def framed(u, v, h, w):
+def _inside(u, v, h, w):
     """Whether a point lies in a picture of h × w pixels."""
     return u >= 0 and v >= 0 and u < w and v < h
 
@@ -110,13 +85,13 @@ def shown_at(u, v, reference, view, tolerance):
     h0, w0 = reference.depth.shape
     h, w = view.depth.shape
     ut, vt, good = 0.0, 0.0, False
-    if framed(u, v, h0, w0):
+    if _inside(u, v, h0, w0):
         a, b = int(v), int(u)
         z = float(reference.depth[a, b])
         if z > 0 and reference.usable[a, b]:
-            x, y, zw = unprojected(reference.camera, u, v, z)
-            ut, vt, zt = projected(view.camera, x, y, zw)
-            if framed(ut, vt, h, w):
+            x, y, zw = unproject(reference.camera, u, v, z)
+            ut, vt, zt = project(view.camera, x, y, zw)
+            if _inside(ut, vt, h, w):
                 i, j = int(vt), int(ut)
                 good = view.usable[i, j] and abs(view.depth[i, j] - zt) <= tolerance * zt
     return ut, vt, good
@@ -128,7 +103,7 @@ def _warp_range(
     hi,
     rows,  # [N] pixels of the view's part
     cols,
-    camera,  # [16] of the part
+    camera,  # [18] of the part
     depth,  # [h, w]
     ref,  # Picture of the reference
     tolerance,
@@ -143,9 +118,9 @@ def _warp_range(
         z = float(depth[i, j])
         if z <= 0:
             continue
-        x, y, zw = unprojected(camera, j + 0.5, i + 0.5, z)
-        u0, v0, z0 = projected(ref.camera, x, y, zw)
-        if not framed(u0, v0, h0, w0):
+        x, y, zw = unproject(camera, j + 0.5, i + 0.5, z)
+        u0, v0, z0 = project(ref.camera, x, y, zw)
+        if not _inside(u0, v0, h0, w0):
             continue
         i0, j0 = int(v0), int(u0)
         if abs(ref.depth[i0, j0] - z0) > tolerance * z0:
