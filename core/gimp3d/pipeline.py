@@ -969,7 +969,6 @@ def _carried(
                 camera,
                 depth,
                 [(v.camera, v.depth_before, v.silhouette) for v in so_far.views],
-                settings.mapping,
             ),
             settings.mapping,
             settings.random_seed,
