@@ -32,7 +32,6 @@ from .stages.depth import DepthCompletion, DepthSettings, complete_depth
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.ground import Ground, look_at
 from .stages.growth import Growth
-from .stages.layers import LayerSettings
 from .stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from .stages.light_search import Light
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
@@ -113,7 +112,7 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(largest=1, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),

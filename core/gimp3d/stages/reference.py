@@ -14,13 +14,11 @@ from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..geometry import SOLID, bounds, colours_at, dilated, directions, disparity_of, framed, sees, surface_normals
 from ..schema import AtLeastOne, Many, Share
-from ..solvers.thin_plate import ThinPlateSettings
+from ..solvers.planes import RING
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks
 
-PROVISIONAL = DepthSettings(
-    plate=ThinPlateSettings(unknowns=1000), small_part=300
-)  # where the hidden surface is, about
+PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)  # where the hidden surface is, about
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 
     A surface that is only sampled need not be completed at every pixel.
     """
-    margin = step * (PROVISIONAL.planes.ring + 2)
+    margin = step * (RING + 2)
     rows, cols = (slice(s.start, s.stop, step) for s in bounds(view.target, margin))
     height, width = view.target[rows, cols].shape
     c = view.camera

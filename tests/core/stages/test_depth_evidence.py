@@ -12,7 +12,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.orbit import orbit_cameras
 from gimp3d.stages.depth import DepthSettings, complete_depth
-from gimp3d.stages.depth_evidence import free_space, gather_depth_evidence
+from gimp3d.stages.depth.evidence import free_space, gather_depth_evidence
 from gimp3d.stages.masks import ViewMasks
 
 REGION = (Box.make([0, 0, 0.2], [0.45, 0.45, 0.45]),)

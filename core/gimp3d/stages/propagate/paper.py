@@ -57,8 +57,8 @@ class Mapped:
         rows, cols = (x.astype(np.int32) for x in np.nonzero(there))
         index = np.full(there.shape, -1, np.int32)
         index[rows, cols] = np.arange(len(rows))
-        sources = (np.ascontiguousarray(f[rows, cols], np.int32) for f in (reference.rows, reference.cols))
-        return cls(reference, picture_of(reference), rows, cols, *sources, index)
+        to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in (reference.rows, reference.cols))
+        return cls(reference, picture_of(reference), rows, cols, to_rows, to_cols, index)
 
     def sources_in(self, view: Picture, reach: int) -> Sources:
         """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not.

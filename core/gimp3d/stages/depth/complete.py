@@ -1,4 +1,4 @@
-"""The surface behind the object: completing the reference's disparity (paper 3.3, METHOD section 3)."""
+"""The surface behind the object: completing the reference's disparity (paper 3.3; docs/method.md)."""
 
 from __future__ import annotations
 
@@ -9,16 +9,23 @@ import cv2
 import numpy as np
 import scipy.ndimage
 
-from ..errors import IllPosed
-from ..priors.monodepth import DepthPrior, relative_disparity
-from ..solvers.poisson import solve_poisson
-from .depth_evidence import DepthEvidence, free_space, gather_depth_evidence
-from .depth_fill import DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
-from .depth_prior import PriorFit, fit_prior
-from .layers import AROUND, distance_to, without_front
-from .masks import ViewMasks
+from ...errors import IllPosed
+from ...geometry import bounds
+from ...priors.monodepth import DepthPrior, relative_disparity
+from ...solvers.planes import RING
+from ...solvers.poisson import solve_poisson
+from ..masks import ViewMasks
+from .evidence import AGREEMENT, DepthEvidence, free_space, gather_depth_evidence
+from .fill import WITHHELD, DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
+from .layers import AROUND, BAND, distance_to, without_front
+from .prior import PriorFit, fit_prior
 
-__all__ = ["DepthCompletion", "DepthSettings", "PriorFit", "complete_depth", "complete_disparity", "fit_prior"]
+LEAST_ISLAND = 0.02  # share of the hole that evidence must hold to stand alone before the surface
+MOSTLY = 0.5  # share of a part of the ring that must be below what other views see there for it to be a leak
+# Times the miss of a withheld band without a prior, at which it is believed by half: as its fit allows, or anyhow
+PRIOR_MISS, PRIOR_GAIN = 3.0, 0.8
+LOW, HIGH = 0.25, 4.0  # completed disparities are clamped to [LOW · ring's least, HIGH · ring's greatest]
+EXPECTED = 0.02  # relative error at which a pixel's confidence is one half
 
 
 @dataclass(frozen=True)
@@ -57,21 +64,20 @@ def complete_depth(
     IllPosed
         As `complete_disparity`.
     """
-    known = without_front(disparity, known, view.target, view.occluder, settings.layers)
-    ring = known & (distance_to(view.target) <= settings.planes.ring)
-    measured = gather_depth_evidence(view, views, settings.evidence, ring)
-    fallen = ring & (disparity < (1 - settings.evidence.agreement) * measured.disparity)
-    mostly = replace(settings.layers, front_share=0.5)
-    known = without_front(disparity, known, view.target, fallen, mostly) & ~fallen
+    known = without_front(disparity, known, view.target, view.occluder, step=settings.layer_step)
+    ring = known & (distance_to(view.target) <= RING)
+    measured = gather_depth_evidence(view, views, ring)
+    fallen = ring & (disparity < (1 - AGREEMENT) * measured.disparity)
+    known = without_front(disparity, known, view.target, fallen, MOSTLY, settings.layer_step) & ~fallen
     evidence = _without(measured, ~view.target)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
-    space = free_space(view, views, ring & known, settings.evidence)
+    space = free_space(view, views, ring & known)
 
     def complete(evidence: DepthEvidence | None) -> DepthCompletion:
         return complete_disparity(disparity, known, view.target, relative, settings, evidence)
 
     done = complete(None)
-    behind = (evidence.weight > 0) & (evidence.disparity < (1 - settings.layers.step) * done.disparity)
+    behind = (evidence.weight > 0) & (evidence.disparity < (1 - settings.layer_step) * done.disparity)
     evidence = _without(evidence, behind & ~space.seen_past(done.depth, behind))
     evidence = _without(evidence, _remains(evidence, done.disparity, view.target, settings))
     if (evidence.weight > 0).any():
@@ -103,11 +109,11 @@ def complete_depth(
 
 def _remains(evidence: DepthEvidence, disparity: np.ndarray, hole: np.ndarray, settings: DepthSettings) -> np.ndarray:
     """[H, W] bool: small islands of evidence before the completed surface: splats of the object that were kept."""
-    before = (evidence.weight > 0) & (evidence.disparity > (1 + settings.layers.step / 2) * disparity)
+    before = (evidence.weight > 0) & (evidence.disparity > (1 + settings.layer_step / 2) * disparity)
     islands, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(before, AROUND), AROUND)
     area = np.bincount(islands[before], minlength=count + 1)
     beside_rim = np.bincount(islands[~hole], minlength=count + 1) > 0
-    return before & (area < settings.least_island * hole.sum())[islands] & ~beside_rim[islands]
+    return before & (area < LEAST_ISLAND * hole.sum())[islands] & ~beside_rim[islands]
 
 
 def _without(evidence: DepthEvidence, dropped: np.ndarray) -> DepthEvidence:
@@ -125,7 +131,7 @@ def complete_disparity(
     """Fill a hole in a disparity map.
 
     With a prior, in the gradient domain (paper 3.3): Δd = s_f Δd_m on the hole with d fixed on its known rim and
-    natural boundaries elsewhere; the printed divergence has the opposite sign (METHOD section 3). Without one, planes
+    natural boundaries elsewhere; the printed divergence has the opposite sign (docs/method.md). Without one, planes
     on which the surroundings lie are continued (`planar_surfaces`), and what lies on none by a thin plate. Nothing
     smears across layers: rims of occluders are no boundary (`background_rim`), layers that a step parts keep their
     parts of the hole, and so does sky. Evidence screens the solves (Σ_q (d_q − d_p) + w (e − d_p) = …) and takes part
@@ -161,7 +167,7 @@ def complete_disparity(
     reasons: list[str] = [fit.reason]
     for part in _parts(hole, settings.small_part):
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
-        window = _window(part, settings.planes.ring + 1) if near else np.s_[:, :]
+        window = bounds(part, RING + 1) if near else np.s_[:, :]
         inside, evident = part[window], (weight * part)[window]
         around = surroundings(scene[window], trusted[window], inside, evident, settings)
         own = replace(settings, surface="harmonic" if part.sum() <= settings.small_part else settings.surface)
@@ -180,9 +186,9 @@ def complete_disparity(
                 used = believed * fit.guide_scale
                 reasons.append("" if believed > 0.95 else f"prior believed by {believed:.0%}")
             around, sure = guided, max(sure, believed)
-        settled = _settle(filled, around, fit.shift, settings)
+        settled = _settle(filled, around, fit.shift)
         result[window][inside] = settled.disparity[inside]
-        trust[window][inside] = (settled.share * sure * _trust(around, missed, settings))[inside]
+        trust[window][inside] = (settled.share * sure * _trust(around, missed))[inside]
         reasons += [*([] if done else [plan.reason]), *settled.notes]
         done.append(settled)
         if part.sum() > 0.05 * hole.sum():
@@ -211,7 +217,7 @@ def _as_far_as_believed(
     if settings.surface not in ("harmonic", "planar"):
         ratio = missed / max(withheld_miss(alone, plan, settings, guided.rim), 1e-9)
         if not np.isnan(ratio):
-            believed = max(believed, _falling(ratio / settings.prior_gain)) * _falling(ratio / settings.prior_miss)
+            believed = max(believed, _falling(ratio / PRIOR_GAIN)) * _falling(ratio / PRIOR_MISS)
     if believed >= 0.99:
         return filled, 1.0
     return believed * filled + (1 - believed) * fill(alone, plan, settings), believed
@@ -238,11 +244,11 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     return [*large, rest] if rest.any() else large
 
 
-def _trust(around: Surroundings, missed: float, settings: DepthSettings) -> np.ndarray:
+def _trust(around: Surroundings, missed: float) -> np.ndarray:
     """[H, W]: each pixel's confidence, from the miss on a withheld band and the distance to what is measured."""
     far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
-    expected = (settings.expected if np.isnan(missed) else missed) * (0.5 + far / settings.withheld)
-    return 1 / (1 + expected / settings.expected)
+    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / WITHHELD)
+    return 1 / (1 + expected / EXPECTED)
 
 
 @dataclass(frozen=True)
@@ -255,7 +261,7 @@ class _Settled:
     notes: list[str]
 
 
-def _settle(filled: np.ndarray, around: Surroundings, shift: float, settings: DepthSettings) -> _Settled:
+def _settle(filled: np.ndarray, around: Surroundings, shift: float) -> _Settled:
     """Every pixel decided and kept to the ring's range."""
     share, notes = 1.0, []
     undecided = around.hole & ~np.isfinite(filled)
@@ -266,10 +272,10 @@ def _settle(filled: np.ndarray, around: Surroundings, shift: float, settings: De
         nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
         filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
         notes.append("a part of the hole has no rim: nearest depth used")
-    ring = around.measured & (around.distance <= settings.layers.band)
+    ring = around.measured & (around.distance <= BAND)
     beside = around.disparity[ring if ring.any() else around.measured]
     finite = beside[beside > 0]
-    low, high = (settings.low * finite.min(), settings.high * finite.max()) if len(finite) else (0.0, 0.0)
+    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
     if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
         filled = np.where(filled < low, 0.0, filled)
         low = 0.0
@@ -286,13 +292,4 @@ def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped
     trust = trust.astype(np.float32)
     return DepthCompletion(
         disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, 0, fit.confidence, fit.reason
-    )
-
-
-def _window(hole: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """The hole's bounding box and what is round it."""
-    rows, cols = np.flatnonzero(hole.any(1)), np.flatnonzero(hole.any(0))
-    return (
-        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
-        slice(max(cols[0] - margin, 0), cols[-1] + margin + 1),
     )

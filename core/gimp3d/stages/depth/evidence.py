@@ -1,4 +1,4 @@
-"""What other views measured of the surface behind the object, and what they see past (METHOD section 3)."""
+"""What other views measured of the surface behind the object, and what they see past."""
 
 from __future__ import annotations
 
@@ -8,30 +8,22 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ..camera import Camera
-from ..compute.jit import exact_kernel
-from ..compute.threads import at_once, parallel_map
-from ..schema import AtLeastOne, Positive, Share
-from .layers import steps
-from .masks import ViewMasks
+from ...compute.jit import exact_kernel
+from ...compute.threads import at_once, parallel_map
+from ...geometry import SOLID, dilated, disparity_of, framed, surface_points
+from ..masks import ViewMasks
+from .layers import STEP, steps
 
-
-@dataclass(frozen=True)
-class DepthEvidenceSettings:
-    """Depths and disparities relative, lengths in pixels."""
-
-    unchanged: Share = 0.01  # a view sees the background where removing the object moves its first surface by less
-    solid: Share = 0.9  # alpha from which a surface counts as there
-    margin: int = 1  # px kept from what does not count
-    step: Share = 0.06  # a depth edge: which pixel has which depth is not certain there
-    agreement: Share = 0.03  # samples of one pixel that lie closer are of one surface
-    least_views: int = 2  # that must agree on a surface, or on there being none
-    full: AtLeastOne = 4  # views that make a pixel as sure as one of the reference's own
-    beyond: Share = 0.03  # how far behind a point a view must see to see past it
-    far: Share = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
-    coarse: AtLeastOne = 4  # stride at which it is asked which parts of a view may show the hole
-    push: Positive = 0.01  # first step by which a contradicted surface is pushed back; each is a tenth longer
-    pushes: int = 40  # at most: to 50 times the distance
+# Depths and disparities are relative.
+UNCHANGED = 0.01  # a view sees the background where removing the object moves its first surface by less
+AGREEMENT = 0.03  # samples of one pixel that lie closer are of one surface
+LEAST_VIEWS = 2  # that must agree on a surface, or on there being none
+FULL = 4  # views that make a pixel as sure as one of the reference's own
+BEYOND = 0.03  # how far behind a point a view must see to see past it
+FAR = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
+STRIDE = 4  # px at which it is asked which parts of a view may show the hole
+PUSH, LONGER = 0.01, 1.1  # first step by which a contradicted surface is pushed back; growth of each further one
+PUSHES = 40  # steps at most: to 50 times the distance
 
 
 @dataclass(frozen=True)
@@ -45,7 +37,6 @@ class DepthEvidence:
 def gather_depth_evidence(
     view: ViewMasks,  # the reference
     views: Sequence[ViewMasks],  # the others; the reference among them does not count
-    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
     ring: np.ndarray | None = None,  # [H, W] bool, pixels off the hole that are asked about too
 ) -> DepthEvidence:
     """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
@@ -56,7 +47,7 @@ def gather_depth_evidence(
     """
     others = [v for v in views if v.camera.id != view.camera.id]
     asked = view.target if ring is None else view.target | ring
-    samples = parallel_map(lambda v: _samples(v, view, asked, settings), others, at_once(asked.size))
+    samples = parallel_map(lambda v: _samples(v, view, asked), others, at_once(asked.size))
     h, w = view.target.shape
     found, count = np.zeros(h * w), np.zeros(h * w)
     pixels, disparities = np.concatenate([np.zeros((2, 0)), *samples], axis=1)
@@ -64,70 +55,51 @@ def gather_depth_evidence(
     if len(pixels):
         order = np.lexsort((-disparities, pixels))
         pixels, disparities, origin = pixels[order].astype(int), disparities[order], origin[order]
-        apart = (np.diff(pixels) > 0) | (disparities[1:] < (1 - settings.agreement) * disparities[:-1])
+        apart = (np.diff(pixels) > 0) | (disparities[1:] < (1 - AGREEMENT) * disparities[:-1])
         start = np.flatnonzero(np.r_[True, apart])
         group = np.cumsum(np.r_[0, apart])
         agreeing = np.bincount(np.unique(group * len(samples) + origin) // len(samples), minlength=len(start))
         middle = disparities[start + np.bincount(group) // 2]
-        enough = agreeing >= settings.least_views
+        enough = agreeing >= LEAST_VIEWS
         taken, first = np.unique(pixels[start[enough]], return_index=True)
         found[taken], count[taken] = middle[enough][first], agreeing[enough][first]
     found, count = found.reshape(h, w), count.reshape(h, w)
     nearest = cv2.dilate(found, np.ones((5, 5), np.uint8))
-    count[found < (1 - settings.step) * nearest] = 0
-    weight = np.minimum(count / settings.full, 1)
+    count[found < (1 - STEP) * nearest] = 0
+    weight = np.minimum(count / FULL, 1)
     return DepthEvidence(np.where(weight > 0, found, 0).astype(np.float32), weight.astype(np.float32))
 
 
-def _samples(other: ViewMasks, view: ViewMasks, asked: np.ndarray, settings: DepthEvidenceSettings) -> np.ndarray:
+def _samples(other: ViewMasks, view: ViewMasks, asked: np.ndarray) -> np.ndarray:
     """[2, M]: pixels asked about in the reference (flat indices) and the disparities that a view measured there."""
-    width = view.target.shape[1]
-    rows, cols = np.nonzero(_background(other, settings) & _may_reach(other, view, settings.coarse))
-    points = other.camera.unproject(
-        np.stack([cols + 0.5, rows + 0.5], -1), other.depth_before[rows, cols].astype(float)
-    )
-    _, cols, rows, z = _framed(view.camera, points)
+    shown = np.where(_background(other) & _may_reach(other, view), other.depth_before, 0)
+    _, rows, cols, z = framed(view.camera, surface_points(other.camera, shown)[2])
     # Nothing that the object hides lies before the object itself.
-    front = np.where(view.target, (1 - settings.beyond) * view.depth_before, 0)[rows, cols]
+    front = np.where(view.target, (1 - BEYOND) * view.depth_before, 0)[rows, cols]
     there = asked[rows, cols] & (z > front)
-    return np.stack([rows[there] * width + cols[there], 1 / z[there]])
+    return np.stack([rows[there] * asked.shape[1] + cols[there], 1 / z[there]])
 
 
-def _may_reach(other: ViewMasks, view: ViewMasks, stride: int) -> np.ndarray:
+def _may_reach(other: ViewMasks, view: ViewMasks) -> np.ndarray:
     """[H, W] bool: blocks of a view that may show something of the reference's hole; most do not, which saves time."""
-    coarse = other.depth_before[stride // 2 :: stride, stride // 2 :: stride]
+    coarse = other.depth_before[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
     rows, cols = np.nonzero(coarse > 0)
-    uv = (np.stack([cols, rows], -1) + 0.5) * stride
-    inside, x, y, _ = _framed(view.camera, other.camera.unproject(uv, coarse[rows, cols].astype(float)))
-    near_hole = cv2.dilate(view.target.astype(np.uint8), np.ones((8 * stride + 1,) * 2, np.uint8)) > 0
-    found = np.zeros(coarse.shape, np.uint8)
+    uv = (np.stack([cols, rows], -1) + 0.5) * STRIDE
+    inside, y, x, _ = framed(view.camera, other.camera.unproject(uv, coarse[rows, cols].astype(float)))
+    near_hole = dilated(view.target, 4 * STRIDE)
+    found = np.zeros(coarse.shape, bool)
     found[rows[inside], cols[inside]] = near_hole[y, x]
-    found = cv2.dilate(found, np.ones((3, 3), np.uint8))
-    return (
-        np.kron(np.pad(found, ((0, 1), (0, 1)), "edge"), np.ones((stride, stride), np.uint8))[
-            : other.target.shape[0], : other.target.shape[1]
-        ]
-        > 0
-    )
+    whole = np.pad(dilated(found, 1), ((0, 1), (0, 1)), "edge").repeat(STRIDE, 0).repeat(STRIDE, 1)
+    return whole[: other.target.shape[0], : other.target.shape[1]]
 
 
-def _background(view: ViewMasks, settings: DepthEvidenceSettings) -> np.ndarray:
-    """[H, W] bool: pixels whose first surface is not the object's, off depth edges."""
+def _background(view: ViewMasks) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface is not the object's, off depth edges, whose depths are uncertain."""
     depth = view.depth_before
-    there = (depth > 0) & (view.alpha_after > settings.solid)
-    same = there & (np.abs(view.depth_after - depth) <= settings.unchanged * depth)
-    disparity = np.divide(1, depth, out=np.zeros_like(depth), where=there)
-    doubtful = there & ~same | steps(disparity, there, settings.step)
-    return same & (cv2.dilate(doubtful.astype(np.uint8), np.ones((2 * settings.margin + 1,) * 2, np.uint8)) == 0)
-
-
-def _framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(indices, cols, rows, z) of the points that lie in a view's frame."""
-    uv, z = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    cols, rows = uv[inside].astype(int).T
-    return np.flatnonzero(inside), cols, rows, z[inside]
+    there = (depth > 0) & (view.alpha_after > SOLID)
+    same = there & (np.abs(view.depth_after - depth) <= UNCHANGED * depth)
+    doubtful = there & ~same | steps(np.where(there, disparity_of(depth), 0), there)
+    return same & ~dilated(doubtful, 1)
 
 
 @dataclass(frozen=True)
@@ -137,7 +109,6 @@ class FreeSpace:
     view: ViewMasks  # the reference
     others: tuple[ViewMasks, ...]
     margin: int  # views by which those that see past must outnumber those that see a surface
-    settings: DepthEvidenceSettings
 
     def seen_past(
         self,
@@ -151,11 +122,11 @@ class FreeSpace:
         """
         rows, cols = np.nonzero(pixels & (depth > 0))
         past, excess = self._votes(depth, rows, cols)
-        view, tolerance = self.view, 1 - self.settings.beyond
+        view, tolerance = self.view, 1 - BEYOND
         object_there = (view.depth_after <= 0) | (view.depth_before < tolerance * view.depth_after)
-        before_object = (depth < tolerance * view.depth_before) & (depth > self.settings.far * view.depth_before)
+        before_object = (depth < tolerance * view.depth_before) & (depth > FAR * view.depth_before)
         found = np.zeros(pixels.shape, bool)
-        found[rows, cols] = (past >= self.settings.least_views) & (excess > self.margin)
+        found[rows, cols] = (past >= LEAST_VIEWS) & (excess > self.margin)
         return found | (before_object & object_there & pixels & (depth > 0))
 
     def pushed_back(
@@ -168,24 +139,24 @@ class FreeSpace:
         0 elsewhere, and where there is no such place within reach.
         """
         moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
-        for k in range(self.settings.pushes):
+        for k in range(PUSHES):
             if not left.any():
                 break
-            moved = np.where(left, moved * (1 + self.settings.push * 1.1**k), moved)
+            moved = np.where(left, moved * (1 + PUSH * LONGER**k), moved)
             left = self.seen_past(moved, left)
         return np.where(left, 0.0, moved).astype(np.float32)
 
     def _votes(self, depth: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Per pixel: the other views that see past it, and by how many more they are than those that see it."""
+        """[N] each: how many other views see past a pixel's point, and that number less those that show it."""
         uv = np.stack([cols + 0.5, rows + 0.5], -1)
         points = self.view.camera.unproject(uv, depth[rows, cols].astype(np.float64))
         past, there = np.zeros(len(points), int), np.zeros(len(points), int)
         for other in self.others:
-            index, x, y, z = _framed(other.camera, points)
+            index, y, x, z = framed(other.camera, points)
             near, far = np.empty((2, len(index)), np.float32)
             _extremes(np.ascontiguousarray(other.depth_before), x, y, near, far)
-            past[index] += near > (1 + self.settings.beyond) * z
-            there[index] += (near <= (1 + self.settings.beyond) * z) & (far >= (1 - self.settings.beyond) * z)
+            past[index] += near > (1 + BEYOND) * z
+            there[index] += (near <= (1 + BEYOND) * z) & (far >= (1 - BEYOND) * z)
         return past, past - there
 
 
@@ -193,13 +164,12 @@ def free_space(
     view: ViewMasks,  # the reference
     views: Sequence[ViewMasks],
     trusted: np.ndarray,  # [H, W] bool, the reference's own surfaces: what views say of them shows how far to trust it
-    settings: DepthEvidenceSettings = DepthEvidenceSettings(),
 ) -> FreeSpace:
     """What other views see through. The margin is what 95 % of the reference's own surfaces stay below.
 
     In scans with poor depths, views "see past" tables; they must then say so more clearly of the hole than of these.
     """
-    space = FreeSpace(view, tuple(v for v in views if v.camera.id != view.camera.id), 0, settings)
+    space = FreeSpace(view, tuple(v for v in views if v.camera.id != view.camera.id), 0)
     rows, cols = np.nonzero(trusted & (view.depth_after > 0))
     if len(rows) == 0:
         return space
