@@ -1048,7 +1048,7 @@ def _complete_depth(
         words = f"{share:.0%} of the hole lies on charts"
         known = np.ones(depth.shape, np.float32)
         return DepthCompletion(
-            disparity_of(depth), depth, known, 0.0, np.zeros((0, 2), np.float32), (0.0, 0.0), 0, 0, share, words
+            disparity_of(depth), depth, known, 0.0, np.zeros((0, 2), np.float32), (0.0, 0.0), 0, share, words
         )
     picture, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:

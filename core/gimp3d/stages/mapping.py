@@ -22,10 +22,9 @@ MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has f
 class MappingSettings:
     """How sources are judged."""
 
-    # λ_v (paper eq. 8, sign mended): cost of a source that no view sees, (11 grey levels)²; likeness against visibility
-    visibility: Signed = 0.002
+    visibility: Signed = 0.002  # squared colour difference, λ_v of eq. 8, (11 grey levels)²; likeness, what views see
     geometry: bool = True  # patches lie on the surface; the paper's lie in the picture
-    as_printed: bool = False  # patches are compared at f(p) and copied from p + f(p): the paper's cost misses p
+    as_printed: bool = False  # compared at f(p), copied from p + f(p); nothing: the paper's cost misses p
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
 

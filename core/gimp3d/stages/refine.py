@@ -36,8 +36,8 @@ COLOUR, VIEW_DEPENDENCE = 0.0025, 0.000125
 class RefineSettings:
     """How long the new Gaussians are optimised."""
 
-    steps: Annotated[int, Between(0, 1_000_000)] = 0  # one view each, 0: the closed form is final; time against dB
-    views: AtLeastOne = 48  # of the painted ones, at most; each holds its part of the scene in memory
+    steps: Annotated[int, Between(0, 1_000_000)] = 0  # of one view each, 0: the closed form is final; time against dB
+    views: AtLeastOne = 48  # of the painted ones, at most; memory against what the others show
     check: AtLeastOne = 25  # steps between two looks at the held-out views; time against the best moment to stop
     patience: AtLeastOne = 2  # looks without an improvement before it stops; time against a late improvement
 

@@ -36,13 +36,12 @@ LOOKS = 12  # painted views that colours are corrected by; more gain nothing tha
 class SeedSettings:
     """How the completed reference becomes Gaussians."""
 
-    spread: Positive = 0.75  # sides of a patch, σ of its splat on screen with the low-pass; smooth against sharp
-    # px, a power of two: the longest side of a patch; 1: one Gaussian per pixel (paper)
-    largest: Annotated[int, Between(1, 64)] = 4
-    detail: float = 20.0  # squared grey levels × px over channels: a patch that varies more is halved; count, detail
-    opacity: Annotated[float, Between(0.01, 0.999)] = 0.98  # of new Gaussians; what lies behind shines through less
-    corrections: int = 1  # steps by which colours are corrected so that the drawn scene shows the painted views; time
-    sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new Gaussians; each gets what its observations support
+    spread: Positive = 0.75  # sides of a patch, σ of its splat on screen; smooth against sharp
+    largest: Annotated[int, Between(1, 64)] = 4  # px, a power of two, side of a patch; fewer splats (paper: 1 px each)
+    detail: float = 20.0  # squared grey levels × px that a patch may vary by; fewer splats against sharp ones
+    opacity: Annotated[float, Between(0.01, 0.999)] = 0.98  # of new splats; what they hide against gradients to refine
+    corrections: int = 1  # steps of least squares; time against seams and too dark views
+    sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new splats; size against gloss
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
     harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)

@@ -15,16 +15,17 @@ from ...priors.monodepth import DepthPrior, relative_disparity
 from ...solvers.planes import RING
 from ...solvers.poisson import solve_poisson
 from ..masks import ViewMasks
-from .evidence import AGREEMENT, DepthEvidence, free_space, gather_depth_evidence
-from .fill import WITHHELD, DepthSettings, Surroundings, choose_plan, fill, surroundings, withheld_miss
+from .evidence import AGREEMENT, DepthEvidence, gather_depth_evidence
+from .fill import HOLD_OUT, DepthSettings, Surroundings, choose_plan, fill, hold_out_miss, surroundings
 from .layers import AROUND, BAND, distance_to, without_front
 from .prior import PriorFit, fit_prior
 
 LEAST_ISLAND = 0.02  # share of the hole that evidence must hold to stand alone before the surface
 MOSTLY = 0.5  # share of a part of the ring that must be below what other views see there for it to be a leak
-# Times the miss of a withheld band without a prior, at which it is believed by half: as its fit allows, or anyhow
+# Times the miss of a hold-out band without a prior, at which it is believed by half: as its fit allows, or anyhow
 PRIOR_MISS, PRIOR_GAIN = 3.0, 0.8
 LOW, HIGH = 0.25, 4.0  # completed disparities are clamped to [LOW · ring's least, HIGH · ring's greatest]
+LARGE = 0.05  # share of the hole or of a part of it that has a say in the confidence
 EXPECTED = 0.02  # relative error at which a pixel's confidence is one half
 
 
@@ -39,7 +40,6 @@ class DepthCompletion:
     ring: np.ndarray  # [N, 2] float32 (prior, scene's disparity) of ring pixels, to which s_f was fitted
     line: tuple[float, float]  # (slope, offset) of that fit; s_f is the slope as far as the prior is believed
     clamped: int  # pixels whose disparity had to be clamped
-    contradicted: int  # pixels that other views see past
     confidence: float  # 0 to 1
     reason: str
 
@@ -54,10 +54,8 @@ def complete_depth(
 ) -> DepthCompletion:
     """Complete a view's depth (`complete_disparity`) with what other views saw of the hole.
 
-    Evidence clearly behind a surface that no view sees past is seen from under that surface, and dropped. A completed
-    surface that views do see past is pushed back along its rays to where they do not. What is contradicted even then
-    is counted and has low confidence. Round the hole, pixels whose depth falls through a surface that other views agree
-    on are not trusted: scans have leaks.
+    Evidence clearly behind the surface that the surroundings tell is seen from under it, and dropped. Round the hole,
+    pixels whose depth falls through a surface that other views agree on are not trusted: scans have leaks.
 
     Raises
     ------
@@ -71,40 +69,19 @@ def complete_depth(
     known = without_front(disparity, known, view.target, fallen, MOSTLY, settings.layer_step) & ~fallen
     evidence = _without(measured, ~view.target)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
-    space = free_space(view, views, ring & known)
 
     def complete(evidence: DepthEvidence | None) -> DepthCompletion:
         return complete_disparity(disparity, known, view.target, relative, settings, evidence)
 
     done = complete(None)
-    behind = (evidence.weight > 0) & (evidence.disparity < (1 - settings.layer_step) * done.disparity)
-    evidence = _without(evidence, behind & ~space.seen_past(done.depth, behind))
+    evidence = _without(evidence, evidence.disparity < (1 - settings.layer_step) * done.disparity)
     evidence = _without(evidence, _remains(evidence, done.disparity, view.target, settings))
-    if (evidence.weight > 0).any():
-        done = complete(evidence)
-    contradicted = space.seen_past(done.depth, view.target)
-    pushed = int(contradicted.sum())
-    if pushed:
-        moved = space.pushed_back(done.depth, contradicted)
-        there = moved > 0
-        depth = np.where(there, moved, done.depth)
-        done = replace(done, depth=depth, disparity=np.divide(1, depth, out=done.disparity.copy(), where=there))
-        contradicted &= ~there
-    left = int(contradicted.sum())
+    if not (evidence.weight > 0).any():
+        return done
+    done = complete(evidence)
     seen = float((evidence.weight > 0).sum() / max(1, view.target.sum()))
-    words = [done.reason]
-    if seen >= 0.005:
-        words.append(f"{seen:.0%} of the hole measured by other views")
-    if pushed:
-        words.append(f"{pushed} pixels pushed back from where other views see through, {left} left")
-    share = left / max(1, view.target.sum())
-    return replace(
-        done,
-        trust=np.where(contradicted, np.minimum(done.trust, 0.1), done.trust),
-        contradicted=left,
-        confidence=done.confidence * (1 - share),
-        reason="; ".join(words),
-    )
+    words = f"; {seen:.0%} of the hole measured by other views" if seen >= 0.005 else ""
+    return replace(done, reason=done.reason + words)
 
 
 def _remains(evidence: DepthEvidence, disparity: np.ndarray, hole: np.ndarray, settings: DepthSettings) -> np.ndarray:
@@ -162,52 +139,93 @@ def complete_disparity(
     if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     result, trust = scene.copy(), np.ones(hole.shape)
-    done: list[_Settled] = []
-    most_sure, used = 1.0, fit.scale
-    reasons: list[str] = [fit.reason]
+    done: list[_Part] = []
     for part in _parts(hole, settings.small_part):
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = bounds(part, RING + 1) if near else np.s_[:, :]
         inside, evident = part[window], (weight * part)[window]
-        around = surroundings(scene[window], trusted[window], inside, evident, settings)
-        own = replace(settings, surface="harmonic" if part.sum() <= settings.small_part else settings.surface)
-        sure = fit.confidence
-        if guide is None:
-            plan = choose_plan(around, own, insist=not done)
-            missed, filled = withheld_miss(around, plan, settings, around.rim), fill(around, plan, settings)
-        else:
+        alone = surroundings(scene[window], trusted[window], inside, evident, settings)
+        guided = None
+        if guide is not None:
             guided = surroundings(scene[window], on_line[window], inside, evident, settings, guide[window])
-            if not guided.touching.any():
-                guided = replace(around, guide=guide[window])
-            plan = choose_plan(guided, own)
-            missed = withheld_miss(guided, plan, settings, guided.rim)
-            filled, believed = _as_far_as_believed(fill(guided, plan, settings), missed, fit, guided, around, own)
-            if not done:  # the largest part's
-                used = believed * fit.guide_scale
-                reasons.append("" if believed > 0.95 else f"prior believed by {believed:.0%}")
-            around, sure = guided, max(sure, believed)
-        settled = _settle(filled, around, fit.shift)
-        result[window][inside] = settled.disparity[inside]
-        trust[window][inside] = (settled.share * sure * _trust(around, missed))[inside]
-        reasons += [*([] if done else [plan.reason]), *settled.notes]
-        done.append(settled)
-        if part.sum() > 0.05 * hole.sum():
-            most_sure = min(most_sure, settled.share, sure)
-    confidence = min(float(trust[hole].mean()), most_sure)
+        own = replace(settings, surface="harmonic") if part.sum() <= settings.small_part else settings
+        found = _completed_part(alone, guided, fit, own, first=not done)
+        result[window][inside], trust[window][inside] = found.disparity[inside], found.trust[inside]
+        done.append(found)
+    confidence = min([float(trust[hole].mean()), *(p.sure for p in done if p.pixels > LARGE * hole.sum())])
+    reasons = [fit.reason, *(note for part in done for note in part.notes)]
     reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
-    clamped = sum(s.clamped for s in done)
-    return _completion(result, replace(fit, scale=used, confidence=confidence, reason=reason), trust, clamped)
+    used = fit.scale if guide is None else done[0].believed * fit.guide_scale
+    fit = replace(fit, scale=used, confidence=confidence, reason=reason)
+    return _completion(result, fit, trust, sum(part.clamped for part in done))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A connected part of the hole with every pixel decided."""
+
+    disparity: np.ndarray  # [H, W]
+    trust: np.ndarray  # [H, W], each pixel's confidence
+    pixels: int
+    sure: float  # confidence of the whole part, at most
+    believed: float  # how much of it is the prior's
+    clamped: int  # pixels
+    notes: list[str]
+
+
+def _completed_part(
+    alone: Surroundings, guided: Surroundings | None, fit: PriorFit, settings: DepthSettings, first: bool
+) -> _Part:
+    """What is round one part continued into it, with the prior as far as that is believed."""
+    if guided is None:
+        around, believed, notes = alone, 0.0, []
+        plan = choose_plan(alone, settings, insist=first)
+        missed, filled = hold_out_miss(alone, plan, settings, alone.rim), fill(alone, plan, settings)
+    else:
+        around = guided if guided.touching.any() else replace(alone, guide=guided.guide)
+        plan = choose_plan(around, settings)
+        missed = hold_out_miss(around, plan, settings, around.rim)
+        filled, believed = _as_far_as_believed(fill(around, plan, settings), missed, fit, around, alone, settings)
+        notes = [f"prior believed by {believed:.0%}"] if believed <= 0.95 else []
+    notes = [*notes, plan.reason] if first else []
+    share, pixels = 1.0, int(around.hole.sum())
+    undecided = around.hole & ~np.isfinite(filled)
+    if undecided.any() and around.guide is not None:
+        filled, share = np.where(undecided, around.guide + fit.shift, filled), 0.5
+        notes.append("a part of the hole has no rim: the prior used as it is aligned")
+    elif undecided.any():
+        nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
+        filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
+        notes.append("a part of the hole has no rim: nearest depth used")
+    filled, clamped = _clamped(filled, around)
+    if clamped > LARGE * pixels:
+        share *= 0.5
+        notes.append(f"{clamped} pixels clamped to the ring's range")
+    sure = max(fit.confidence, believed)
+    return _Part(filled, share * sure * _trust(around, missed), pixels, min(share, sure), believed, clamped, notes)
+
+
+def _clamped(filled: np.ndarray, around: Surroundings) -> tuple[np.ndarray, int]:
+    """The disparities kept to the ring's range, and how many of the hole's were not in it."""
+    ring = around.measured & (around.distance <= BAND)
+    beside = around.disparity[ring if ring.any() else around.measured]
+    finite = beside[beside > 0]
+    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
+    if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
+        filled = np.where(filled < low, 0.0, filled)
+        low = 0.0
+    return np.clip(filled, low, high), int((around.hole & ((filled < low) | (filled > high))).sum())
 
 
 def _as_far_as_believed(
     filled: np.ndarray,  # [H, W] the hole's disparity with the prior
-    missed: float,  # by it on the withheld band
+    missed: float,  # by it on the hold-out band
     fit: PriorFit,
     guided: Surroundings,
     alone: Surroundings,  # without the prior
     settings: DepthSettings,
 ) -> tuple[np.ndarray, float]:
-    """The hole with as much of the prior as its fit and its miss on a withheld band allow, and how much that is.
+    """The hole with as much of the prior as its fit and its miss on a hold-out band allow, and how much that is.
 
     The fit tells a prior's scale, but not that its error is larger than what planes or a plate miss without it.
     """
@@ -215,7 +233,7 @@ def _as_far_as_believed(
         return filled, fit.believed
     plan, believed = choose_plan(alone, settings, insist=False), fit.believed
     if settings.surface not in ("harmonic", "planar"):
-        ratio = missed / max(withheld_miss(alone, plan, settings, guided.rim), 1e-9)
+        ratio = missed / max(hold_out_miss(alone, plan, settings, guided.rim), 1e-9)
         if not np.isnan(ratio):
             believed = max(believed, _falling(ratio / PRIOR_GAIN)) * _falling(ratio / PRIOR_MISS)
     if believed >= 0.99:
@@ -245,51 +263,14 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
 
 
 def _trust(around: Surroundings, missed: float) -> np.ndarray:
-    """[H, W]: each pixel's confidence, from the miss on a withheld band and the distance to what is measured."""
+    """[H, W]: each pixel's confidence, from the miss on a hold-out band and the distance to what is measured."""
     far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
-    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / WITHHELD)
+    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / HOLD_OUT)
     return 1 / (1 + expected / EXPECTED)
-
-
-@dataclass(frozen=True)
-class _Settled:
-    """A part of the hole with every pixel decided."""
-
-    disparity: np.ndarray  # [H, W]
-    clamped: int
-    share: float  # of the confidence that is left
-    notes: list[str]
-
-
-def _settle(filled: np.ndarray, around: Surroundings, shift: float) -> _Settled:
-    """Every pixel decided and kept to the ring's range."""
-    share, notes = 1.0, []
-    undecided = around.hole & ~np.isfinite(filled)
-    if undecided.any() and around.guide is not None:
-        filled, share = np.where(undecided, around.guide + shift, filled), 0.5
-        notes.append("a part of the hole has no rim: the prior used as it is aligned")
-    elif undecided.any():
-        nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
-        filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
-        notes.append("a part of the hole has no rim: nearest depth used")
-    ring = around.measured & (around.distance <= BAND)
-    beside = around.disparity[ring if ring.any() else around.measured]
-    finite = beside[beside > 0]
-    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
-    if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
-        filled = np.where(filled < low, 0.0, filled)
-        low = 0.0
-    clamped = int((around.hole & ((filled < low) | (filled > high))).sum())
-    if clamped > 0.05 * around.hole.sum():
-        share *= 0.5
-        notes.append(f"{clamped} pixels clamped to the ring's range")
-    return _Settled(np.clip(filled, low, high), clamped, share, notes)
 
 
 def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int) -> DepthCompletion:
     disparity = disparity.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
     trust = trust.astype(np.float32)
-    return DepthCompletion(
-        disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, 0, fit.confidence, fit.reason
-    )
+    return DepthCompletion(disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, fit.confidence, fit.reason)

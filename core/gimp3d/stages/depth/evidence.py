@@ -1,14 +1,13 @@
-"""What other views measured of the surface behind the object, and what they see past."""
+"""What other views measured of the surface behind the object."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from ...compute.jit import exact_kernel
 from ...compute.threads import at_once, parallel_map
 from ...geometry import SOLID, dilated, disparity_of, framed, surface_points
 from ..masks import ViewMasks
@@ -17,13 +16,10 @@ from .layers import STEP, steps
 # Depths and disparities are relative.
 UNCHANGED = 0.01  # a view sees the background where removing the object moves its first surface by less
 AGREEMENT = 0.03  # samples of one pixel that lie closer are of one surface
-LEAST_VIEWS = 2  # that must agree on a surface, or on there being none
+LEAST_VIEWS = 2  # that must agree on a surface
 FULL = 4  # views that make a pixel as sure as one of the reference's own
-BEYOND = 0.03  # how far behind a point a view must see to see past it
-FAR = 0.75  # of the object's depth: what is nearer than that says that the depths are wrong, not the surface
+BEFORE = 0.03  # how far before the object a sample must lie to be wrong
 STRIDE = 4  # px at which it is asked which parts of a view may show the hole
-PUSH, LONGER = 0.01, 1.1  # first step by which a contradicted surface is pushed back; growth of each further one
-PUSHES = 40  # steps at most: to 50 times the distance
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ def _samples(other: ViewMasks, view: ViewMasks, asked: np.ndarray) -> np.ndarray
     shown = np.where(_background(other) & _may_reach(other, view), other.depth_before, 0)
     _, rows, cols, z = framed(view.camera, surface_points(other.camera, shown)[2])
     # Nothing that the object hides lies before the object itself.
-    front = np.where(view.target, (1 - BEYOND) * view.depth_before, 0)[rows, cols]
+    front = np.where(view.target, (1 - BEFORE) * view.depth_before, 0)[rows, cols]
     there = asked[rows, cols] & (z > front)
     return np.stack([rows[there] * asked.shape[1] + cols[there], 1 / z[there]])
 
@@ -100,89 +96,3 @@ def _background(view: ViewMasks) -> np.ndarray:
     same = there & (np.abs(view.depth_after - depth) <= UNCHANGED * depth)
     doubtful = there & ~same | steps(np.where(there, disparity_of(depth), 0), there)
     return same & ~dilated(doubtful, 1)
-
-
-@dataclass(frozen=True)
-class FreeSpace:
-    """Where views see through: no surface of the background can stand there."""
-
-    view: ViewMasks  # the reference
-    others: tuple[ViewMasks, ...]
-    margin: int  # views by which those that see past must outnumber those that see a surface
-
-    def seen_past(
-        self,
-        depth: np.ndarray,  # [H, W] completed z-depth
-        pixels: np.ndarray,  # [H, W] bool, those asked about
-    ) -> np.ndarray:
-        """[H, W] bool: pixels whose completed surface stands where views see through.
-
-        The reference sees the object, and nothing in front of it. Another view sees past a point if all it sees round
-        its pixel lies clearly behind; enough others must. Where a view sees nothing (alpha below ½), it says nothing.
-        """
-        rows, cols = np.nonzero(pixels & (depth > 0))
-        past, excess = self._votes(depth, rows, cols)
-        view, tolerance = self.view, 1 - BEYOND
-        object_there = (view.depth_after <= 0) | (view.depth_before < tolerance * view.depth_after)
-        before_object = (depth < tolerance * view.depth_before) & (depth > FAR * view.depth_before)
-        found = np.zeros(pixels.shape, bool)
-        found[rows, cols] = (past >= LEAST_VIEWS) & (excess > self.margin)
-        return found | (before_object & object_there & pixels & (depth > 0))
-
-    def pushed_back(
-        self,
-        depth: np.ndarray,  # [H, W] completed z-depth
-        contradicted: np.ndarray,  # [H, W] bool
-    ) -> np.ndarray:
-        """[H, W] z-depth: contradicted pixels moved away along their rays to where no view sees through any more.
-
-        0 elsewhere, and where there is no such place within reach.
-        """
-        moved, left = np.where(contradicted, depth, 0.0).astype(np.float64), contradicted
-        for k in range(PUSHES):
-            if not left.any():
-                break
-            moved = np.where(left, moved * (1 + PUSH * LONGER**k), moved)
-            left = self.seen_past(moved, left)
-        return np.where(left, 0.0, moved).astype(np.float32)
-
-    def _votes(self, depth: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[N] each: how many other views see past a pixel's point, and that number less those that show it."""
-        uv = np.stack([cols + 0.5, rows + 0.5], -1)
-        points = self.view.camera.unproject(uv, depth[rows, cols].astype(np.float64))
-        past, there = np.zeros(len(points), int), np.zeros(len(points), int)
-        for other in self.others:
-            index, y, x, z = framed(other.camera, points)
-            near, far = np.empty((2, len(index)), np.float32)
-            _extremes(np.ascontiguousarray(other.depth_before), x, y, near, far)
-            past[index] += near > (1 + BEYOND) * z
-            there[index] += (near <= (1 + BEYOND) * z) & (far >= (1 - BEYOND) * z)
-        return past, past - there
-
-
-def free_space(
-    view: ViewMasks,  # the reference
-    views: Sequence[ViewMasks],
-    trusted: np.ndarray,  # [H, W] bool, the reference's own surfaces: what views say of them shows how far to trust it
-) -> FreeSpace:
-    """What other views see through. The margin is what 95 % of the reference's own surfaces stay below.
-
-    In scans with poor depths, views "see past" tables; they must then say so more clearly of the hole than of these.
-    """
-    space = FreeSpace(view, tuple(v for v in views if v.camera.id != view.camera.id), 0)
-    rows, cols = np.nonzero(trusted & (view.depth_after > 0))
-    if len(rows) == 0:
-        return space
-    excess = space._votes(view.depth_after, rows, cols)[1]
-    return replace(space, margin=max(0, int(np.percentile(excess, 95))))
-
-
-@exact_kernel
-def _extremes(depth, cols, rows, near, far):
-    """The least z (0: void is near) and the greatest within a pixel of each (col, row)."""
-    height, width = depth.shape
-    for i in range(len(rows)):
-        near[i] = far[i] = depth[rows[i], cols[i]]
-        for v in range(max(0, rows[i] - 1), min(height, rows[i] + 2)):
-            for u in range(max(0, cols[i] - 1), min(width, cols[i] + 2)):
-                near[i], far[i] = min(near[i], depth[v, u]), max(far[i], depth[v, u])

@@ -18,24 +18,24 @@ from .layers import LEAST_LAYER, STEP, background_rim, distance_to, divided, sep
 
 PLANE_SHARE = 0.65  # of the ring that must lie on planes for planes to be continued
 ROUGH = (1.0, 2.0, 4.0)  # times INLIER, tried until so much does: depths of real scans scatter by 9 %, of made ones 1 %
-PLANE_TRUST = 1.4  # planes are taken if they miss a withheld band by this many times a plate's miss; it bends to noise
+PLANE_TRUST = 1.4  # planes are taken if they miss a hold-out band by this many times a plate's miss; it bends to noise
 AVERAGE = 12.0  # px, σ of the average of what the ring deviates from a plane
 SKIN = 1.5  # px, width of the part of the ring next to the hole that the object's haze bends
-WITHHELD = 12  # px, width of the band by which planes and plate are compared
+HOLD_OUT = 12  # px, width of the band by which planes and plate are compared
 PLATE_RING = 12  # px, width of the ring that a plate continues
 LEAST_PIXELS = 10  # of the ring below which nothing can be measured
-KEPT_ERRORS = 0.8  # share of the withheld band that counts, the best: things that stand about test nothing behind them
+KEPT_ERRORS = 0.8  # share of the hold-out band that counts, the best: things that stand about test nothing behind them
 
 
 @dataclass(frozen=True)
 class DepthSettings:
     """How the surface behind the object is continued."""
 
-    # "auto": planes where the ring lies on planes, else smooth; "planar", "smooth" (thin plate), "harmonic" insist
-    surface: Literal["auto", "planar", "smooth", "harmonic"] = "auto"
-    scale_factor: Signed | None = None  # s_f of a prior; None: measured on the ring. The paper uses 0.1
-    layer_step: Positive = STEP  # relative step of disparity that parts two layers; large: none are parted (paper)
-    unknowns: Many = UNKNOWNS  # of a plate, at most; larger holes are solved on a coarser grid; time against detail
+    # auto: planes where the ring lies on planes, else smooth; planar, smooth (thin plate), harmonic insist
+    surface: Literal["auto", "planar", "smooth", "harmonic"] = "auto"  # kind; what is known of the surface
+    scale_factor: Signed | None = None  # disparity per unit of the prior, s_f; none: measured (paper: 0.1)
+    layer_step: Positive = STEP  # relative step of disparity that parts layers; rough scans against low steps
+    unknowns: Many = UNKNOWNS  # of a plate, at most; time against detail
     small_part: Many = 64  # pixels up to which a part of the hole is just interpolated; time against slopes
 
 
@@ -96,7 +96,7 @@ def choose_plan(
     settings: DepthSettings,
     insist: bool = True,  # on planes, if the settings do
 ) -> Plan:
-    """Planes, a thin plate or a membrane, as the settings say; "auto" takes what misses a withheld band by less.
+    """Planes, a thin plate or a membrane, as the settings say; "auto" takes what misses a hold-out band by less.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def choose_plan(
         if kind == "harmonic":
             return plan
         averaged = replace(plan, kind="averaged")
-        misses = [withheld_miss(around, p, settings, around.rim) for p in (averaged, plan)]
+        misses = [hold_out_miss(around, p, settings, around.rim) for p in (averaged, plan)]
         return averaged if misses[0] < misses[1] else plan
     words = "harmonic" if kind == "harmonic" else "smooth: the surroundings' slopes are continued"
     plain = Plan(_layers(around, (), kind == "smooth", settings.layer_step), kind, words)
@@ -125,7 +125,7 @@ def choose_plan(
         if settings.surface == "planar":
             return planes
         on_planes = np.any([layer.on for layer in planes.layers if layer.surface is not None], axis=0)
-        misses = [withheld_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
+        misses = [hold_out_miss(around, plan, settings, on_planes) for plan in (planes, plain)]
         if not misses[0] > PLANE_TRUST * misses[1]:
             return planes
     if settings.surface == "planar" and insist:
@@ -216,13 +216,13 @@ def _deviation(
     return np.nan_to_num(solve_poisson(own, rim, average, weight=around.weight * layer.on, anchor=average).values)
 
 
-def withheld_miss(around: Surroundings, plan: Plan, settings: DepthSettings, where: np.ndarray) -> float:
-    """Mean relative error of a plan's best pixels on a withheld band, when only what lies farther out is told.
+def hold_out_miss(around: Surroundings, plan: Plan, settings: DepthSettings, where: np.ndarray) -> float:
+    """Mean relative error of a plan's best pixels on a hold-out band, when only what lies farther out is told.
 
     Evidence does not count, since the band has it beside it. NaN where too little is left to tell.
     """
-    band = around.rim & (around.distance <= WITHHELD) & (around.disparity > 0)
-    wider = around.hole | (around.distance <= WITHHELD) & ~(around.rim & ~band)
+    band = around.rim & (around.distance <= HOLD_OUT) & (around.disparity > 0)
+    wider = around.hole | (around.distance <= HOLD_OUT) & ~(around.rim & ~band)
     none = np.zeros(wider.shape)
     held = replace(around, rim=around.rim & ~band, hole=wider, distance=distance_to(wider), weight=none)
     tested = band & (around.distance >= SKIN) & where

@@ -204,20 +204,13 @@ def _patch_misfit(reference, i, j, a, b, radius, worst):
 
 @kernel
 def _find_range(
-    lo,
-    hi,
-    rows,  # [M] mapped pixels
-    cols,
-    reference,  # Picture
-    view,  # Picture
-    tolerance,
-    radius,  # of patches
-    reach,  # px of the search
-    worst,  # misfit from which a patch is not alike
-    source_rows,  # [M] in: the field; out: what is used
-    source_cols,
-    rules,  # [M] out
-):
+    lo, hi, rows, cols, reference, view, tolerance, radius, reach, worst, source_rows, source_cols, rules
+):  # fmt: skip
+    """Mapped pixels lo … hi−1 of the lists rows and cols: which source the view shows, and by which rule.
+
+    The sources [M] come in as the field has them and leave as they are used; `worst` is the misfit of patches of a
+    radius from which they are not alike, `reach` how far is searched in px.
+    """
     for k in range(lo, hi):
         i, j = rows[k], cols[k]
         a, b = source_rows[k], source_cols[k]
@@ -248,25 +241,14 @@ def _find_range(
 
 @kernel
 def _sample_range(
-    lo,
-    hi,
-    rows,  # [N] pixels of the view's part that the reference reaches
-    cols,
-    u,  # [h, w] their places in the reference
-    v,
-    index,  # [H, W] of mapped pixels in the lists
-    source_rows,  # [M]
-    source_cols,
-    source_rules,
-    borrowed,  # [M, 3]
-    has,  # [M]
-    reference,  # Picture
-    view,  # Picture
-    tolerance,
-    radius,
-    raw,  # [h, w, 3] in: the warped reference; out: the samples
-    rules,  # [h, w] in and out
-):
+    lo, hi, rows, cols, u, v, index, source_rows, source_cols, source_rules, borrowed, has, reference, view, tolerance,
+    radius, raw, rules
+):  # fmt: skip
+    """Pixels lo … hi−1 of the lists rows and cols, which lie at (u, v) of the reference: the mean over patches.
+
+    `index` [H, W] is the place of the reference's mapped pixels in the lists of sources and of what is borrowed [M].
+    `raw` [h, w, 3] and `rules` [h, w] come in as the warp gives them.
+    """
     h0, w0 = reference.depth.shape
     for k in range(lo, hi):
         i, j = rows[k], cols[k]

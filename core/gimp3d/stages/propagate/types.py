@@ -29,13 +29,13 @@ class Rule(IntEnum):
 class PropagateSettings:
     """How a view is painted: by default what was measured to be best, else as in the paper."""
 
-    # "learned": the reference's colours, changed as this view's pixels tell; "sample": the colours of this view's
-    # mapped sources (paper); "none": the warped reference
-    transfer: Literal["learned", "sample", "none"] = "learned"
-    # "band": fitted to the photo round the hole; "rim": to the rim's pixels alone (paper)
-    blend: Literal["band", "rim"] = "band"
-    retarget: int = 32  # px round a source that is hidden or off-screen, searched for another; 0: none
-    donors: int = 8  # views that may lend samples of sources that a view does not show ("sample" only); 0: none
+    # learned: the reference's colours, changed as this view's pixels tell; sample: the colours of this view's mapped
+    # sources (paper); none: the warped reference
+    transfer: Literal["learned", "sample", "none"] = "learned"  # way; the reference's texture against the view's light
+    # band: fitted to the photo round the hole; rim: to the rim's pixels alone (paper)
+    blend: Literal["band", "rim"] = "band"  # way; an even level against no seam at any pixel of the rim
+    retarget: int = 32  # px searched round a source that is hidden or off-screen; time against more own pixels
+    donors: int = 8  # views that lend samples of sources a view does not show (sample only); time against holes
 
 
 @dataclass(frozen=True)

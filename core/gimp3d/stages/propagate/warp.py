@@ -98,20 +98,11 @@ def shown_at(u, v, reference, view, tolerance):
 
 
 @kernel
-def _warp_range(
-    lo,
-    hi,
-    rows,  # [N] pixels of the view's part
-    cols,
-    camera,  # [18] of the part
-    depth,  # [h, w]
-    ref,  # Picture of the reference
-    tolerance,
-    colours,  # [h, w, 3] out
-    u,  # [h, w] out, place in the reference
-    v,
-):
-    """Pixels lo … hi−1: bilinear samples of those reference pixels that show the same surface."""
+def _warp_range(lo, hi, rows, cols, camera, depth, ref, tolerance, colours, u, v):
+    """Pixels lo … hi−1 of the lists rows and cols: bilinear samples of reference pixels that show the same surface.
+
+    Written are the colours [h, w, 3] and where they lie in the reference, u and v [h, w].
+    """
     h0, w0 = ref.depth.shape
     for k in range(lo, hi):
         i, j = rows[k], cols[k]
