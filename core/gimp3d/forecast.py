@@ -16,6 +16,7 @@ STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # 
 STAGES = {
     "read": (0.321, 0.129, 0.178),
     "masks": (0.565, 0.159, 0.303),
+    "exposure": (0.0, 0.0, 0.0),
     "surfaces": (0.651, 0.047, 0.026),
     "light": (1.677, 0.03, 0.0),
     "lift": (0.0, 0.0, 0.0),
@@ -23,9 +24,10 @@ STAGES = {
     "reference": (0.391, 0.021, 0.0),
     "depth": (0.311, 0.069, 0.0),
     "appearance": (0.11, 0.004, 0.0),
+    "seed": (0.0, 0.0, 0.0),
     "mapping": (0.026, 0.012, 0.001),
     "propagate": (0.336, 0.069, 0.024),
-    "seed": (0.057, 0.022, 0.031),
+    "settle": (0.057, 0.022, 0.031),
     "verdict": (0.274, 0.048, 0.044),
 }
 STEP = (0.00063, 0.04108)  # s of a step of refinement: constant, for each million pixels of a view
