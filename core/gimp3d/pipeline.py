@@ -14,7 +14,6 @@ import scipy.ndimage
 
 from .box import Box, Region
 from .camera import Camera
-from .compute import buffers
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
@@ -336,7 +335,6 @@ def remove_object(
             run.warnings.append(f"--depth-prior {settings.depth_prior} is not used: the reference is a chart")
     done: list[Reference] = []
     for round_, number in enumerate(turns):
-        buffers.release()  # a stage's leavings are of little use to the next
         if round_ and _open_pixels(open_views) < settings.extra_gain * masks.hole_pixels:
             break
         first = round_ == 0
@@ -373,7 +371,6 @@ def remove_object(
         near_new = _where_drawn(new, masks.views)
         painted = _redrawn(painted, filled, masks.views, near_new)
         open_views = _all_still_open(open_views, filled, len(added), rules, near_new, settings.masks)
-    buffers.release()
     asked = _views_refined(run, masks, painted, told, {name: r for name, (_, r) in best.items()}, settings)
     added = _refined(run, kept, added, masks, painted, told, settings)
     left = _open_pixels(open_views)
