@@ -217,7 +217,7 @@ def _soft_ties(task: _Task, weight: np.ndarray, start: np.ndarray) -> _Ties:
 
 
 def _flat_ties(kind: np.ndarray, start: np.ndarray, absent: np.ndarray) -> Iterator[_Ties]:
-    """Between two neighbours of which one has no guidance the wanted gradient is 0; this takes away that of `start`."""
+    """Pairs of neighbours of which one has no guidance are guided by a gradient of 0, not by the start's."""
     index = np.full(kind.shape, -1)
     index[kind == HOLE] = np.arange(len(start))
     for neighbour in (np.roll(index, -1, 0), np.roll(index, -1, 1)):
