@@ -49,7 +49,7 @@ class SeedSettings:
     sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new Gaussians; each gets what its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
-    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
+    harmonics: HarmonicsSettings = HarmonicsSettings(offset=True)
     grey: float = 0.5  # what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
     depth_tolerance: Share = 0.02  # z-test of observations
 
