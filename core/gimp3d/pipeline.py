@@ -18,7 +18,7 @@ from .compute import buffers
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
-from .geometry import disparity_of, sees, window_mask
+from .geometry import SOLID, disparity_of, sees, window_mask
 from .priors.calls import Call
 from .priors.inpaint import Appearance, check_provider, inpaint_reference, painter, paste_picture
 from .priors.monodepth import check_depth_prior, depth_prior, looks
@@ -29,6 +29,7 @@ from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import CHART, Chart, ChartSettings, Hits, Plane, chart_number, draw_charts, find_planes
 from .stages.clearing import ClearingSettings, Targets, chart_targets, clear_air, object_pixels
 from .stages.depth import DepthCompletion, DepthSettings, complete_depth
+from .stages.evidence import EvidenceSettings, gather_evidence
 from .stages.exposure import Exposure, exposure_ring, level_exposure
 from .stages.ground import Ground, look_at
 from .stages.growth import Growth
@@ -48,15 +49,7 @@ from .stages.propagate import (
     near_hole,
     propagate,
 )
-from .stages.reference import (
-    EvidenceSettings,
-    ReferenceChoice,
-    ReferenceSettings,
-    ViewScore,
-    choose_reference,
-    gather_evidence,
-    rim,
-)
+from .stages.reference import ReferenceChoice, ReferenceSettings, ViewScore, choose_reference, rim
 from .stages.refine import (
     Refinement,
     RefineSettings,
@@ -68,6 +61,7 @@ from .stages.reflection import Reflection, find_reflection
 from .stages.seed import SeedSettings, colour_gaussians, seed_gaussians, settle_gaussians
 from .stages.selection import Selection, SelectionSettings
 from .stages.shadow import Shadow, find_shadow, marked_shadow
+from .stages.targets import LAYER_STEP
 from .stages.verdict import Verdict, judge
 from .stages.view_refinement import RefinedView, ViewRefinement, ViewToRefine, refine_views
 from .stages.witness import Witness
@@ -897,7 +891,7 @@ def _fill_from_one_view(
     given: np.ndarray | None,  # [H, W, 3] uint8, its picture
 ) -> tuple[Reference, Gaussians, Propagation]:
     """Complete one reference, carry it into every view, and make its Gaussians."""
-    solid, tried = settings.masks.solid, {c.camera_id for c in run.references}
+    solid, tried = SOLID, {c.camera_id for c in run.references}
     choice: ReferenceChoice = run(
         f"reference{so_far.suffix}", lambda: choose_reference(so_far.views, wanted, solid, settings.reference, tried)
     )
@@ -1068,7 +1062,7 @@ def _complete_depth(
     call = run.call("--depth-prior", stage, settings)
     prior = depth_prior(spec, view.camera.height, view.camera.width, picture, call)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
-    known = rim(view, settings.masks.solid)
+    known = rim(view, SOLID)
     return complete_depth(
         view, open_views, disparity_of(view.depth_after), known, prior, replace(settings.depth, surface=surface)
     )
@@ -1197,12 +1191,12 @@ def _still_open(
     before = view.depth_after, view.alpha_after
     depth, alpha = (np.where(touched, d, b) for d, b in zip(scene.surface_depth(), before))
     covered = scene.footprint(new) > 0.5
-    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > masks.solid)
+    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > SOLID)
     target = view.target & (~covered | (rules == Rule.UNREACHED))
     farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))
     nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
-    at_edge = nearest < (1 - masks.layer_step) * depth
-    joined = coloured & (alpha > masks.solid) & (at_edge | (depth < (1 + masks.layer_step) * farthest))
+    at_edge = nearest < (1 - LAYER_STEP) * depth
+    joined = coloured & (alpha > SOLID) & (at_edge | (depth < (1 + LAYER_STEP) * farthest))
     wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side - 1, side - 1), np.uint8)) > 0
     return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
 
