@@ -19,6 +19,8 @@ WHOLE: Window = (slice(0, None), slice(0, None))
 
 SAME_DEPTH = 0.02  # relative z within which two drawn depths are the same surface: the scatter of settled splats
 SOLID = 0.9  # opacity from which a pixel shows a surface and not a veil before it
+EVIDENCE_DEPTH = 0.006  # relative z within which a photo shows a completed surface: closer than SAME_DEPTH, as a copied
+# pixel of another surface is seen at once, while one that is not copied is only filled
 MOST_ROWS = 32_000  # of a picture that cv2.remap makes; it refuses 32,768
 
 
@@ -34,6 +36,15 @@ def framed(
     return np.flatnonzero(inside), rows, cols, z[inside]
 
 
+def same_surface(
+    drawn: np.ndarray,  # z of a first surface, 0 = nothing
+    z: np.ndarray,  # of the surface that is asked about, 0 = nothing
+    tolerance: float,  # relative
+) -> np.ndarray:
+    """Bool of the arrays' shape: both depths are of one surface."""
+    return (drawn > 0) & (z > 0) & (np.abs(drawn - z) < tolerance * z)
+
+
 def sees(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z of the first surface
@@ -42,9 +53,8 @@ def sees(
 ) -> np.ndarray:
     """[N] bool: the point is framed and is the surface seen there (z-test)."""
     index, rows, cols, z = framed(camera, points)
-    there = depth[rows, cols]
     result = np.zeros(len(points), bool)
-    result[index] = (there > 0) & (np.abs(there - z) < tolerance * z)
+    result[index] = same_surface(depth[rows, cols], z, tolerance)
     return result
 
 

@@ -22,8 +22,9 @@ from ..priors.pasting import paste_picture
 from ..view_state import ViewState
 from .charts import CHART, Chart, chart_number
 from .depth import DepthCompletion, complete_depth
+from .evidence import gather_evidence
 from .propagate import Reference
-from .reference import gather_evidence, rim
+from .reference import rim
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z

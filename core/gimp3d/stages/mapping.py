@@ -10,7 +10,7 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
-from ..geometry import SAME_DEPTH, disparity_of, pack_camera, project, unproject
+from ..geometry import SAME_DEPTH, disparity_of, pack_camera, project
 from ..schema import Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
@@ -50,10 +50,11 @@ def source_visibility(
     One pass per view; nothing is kept of a view but its count.
     """
     count = np.zeros(depth.shape, np.int32)
-    here = pack_camera(camera), np.ascontiguousarray(depth, np.float32)
+    here, back = np.ascontiguousarray(depth, np.float32), np.linalg.inv(camera.viewmat)
     for other, z, hidden in views:
+        as_seen = pack_camera(replace(other, viewmat=other.viewmat @ back))  # from the reference's axes
         there = np.ascontiguousarray(z, np.float32), np.ascontiguousarray(hidden, bool)
-        run_ranges(_count_seen, len(depth), *here, pack_camera(other), *there, SAME_DEPTH, count)
+        run_ranges(_count_seen, len(depth), here, np.linalg.inv(camera.K), as_seen, *there, SAME_DEPTH, count)
     return (count / max(1, len(views))).astype(np.float32)
 
 
@@ -107,13 +108,18 @@ def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> Near
 
 
 @exact_kernel
-def _count_seen(lo, hi, camera, depth, other, there, hidden, tolerance, count):
-    """Add one to every pixel of rows [lo, hi) whose point is the surface that the other view shows there."""
+def _count_seen(lo, hi, depth, inverse, other, there, hidden, tolerance, count):
+    """Add one to every pixel of rows [lo, hi) whose point is the surface that the other view shows there.
+
+    `inverse` is K⁻¹ of the reference, `other` the packed view in its camera axes.
+    """
     for i in range(lo, hi):
         for j in range(depth.shape[1]):
-            if not 0 < depth[i, j] < np.inf:
+            z = float(depth[i, j])
+            if not 0 < z < np.inf:
                 continue
-            x, y, z = unproject(camera, j + 0.5, i + 0.5, float(depth[i, j]))
+            x = (inverse[0, 0] * (j + 0.5) + inverse[0, 2]) * z
+            y = (inverse[1, 1] * (i + 0.5) + inverse[1, 2]) * z
             u, v, seen = project(other, x, y, z)
             if not (0 <= u < other[16] and 0 <= v < other[17]):
                 continue

@@ -49,11 +49,15 @@ def fill_polygon(
     if (high <= low).any():
         return mask
     x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
-    start, end = polygon.astype(np.float64), np.roll(polygon.astype(np.float64), -1, axis=0)
-    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(start, end)]
-    inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
-    mask[low[1] : high[1], low[0] : high[0]] = inside
+    mask[low[1] : high[1], low[0] : high[0]] = _inside(polygon.astype(np.float64), x, y)
     return mask
+
+
+def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Bool of x's shape: points on one side of all edges of a convex polygon [M, 2]."""
+    edges = list(zip(polygon, np.roll(polygon, -1, axis=0)))
+    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in edges]
+    return np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
 
 
 def guard_gaussians(
@@ -65,18 +69,11 @@ def guard_gaussians(
 ) -> np.ndarray:
     """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
     uv, _ = camera.project(gaussians.means.astype(np.float64))
-    centre = polygon.mean(0)
-
-    def inside(outline: np.ndarray) -> np.ndarray:
-        rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
-        start, end = outline, np.roll(outline, -1, axis=0)
-        u, v = uv[rows, 0, None], uv[rows, 1, None]
-        side = (end - start)[:, 0] * (v - start[:, 1]) - (end - start)[:, 1] * (u - start[:, 0])
-        result = np.zeros(len(uv), dtype=bool)
-        result[rows] = (side >= 0).all(1) | (side <= 0).all(1)
-        return result
-
-    return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
+    rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
+    centre, (u, v) = polygon.mean(0), uv[rows].T
+    found = np.zeros(len(uv), bool)
+    found[rows] = _inside(centre + scale * (polygon - centre), u, v) & ~_inside(polygon, u, v)
+    return found
 
 
 def box_window(box: Box, camera: Camera) -> Window:

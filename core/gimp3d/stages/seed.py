@@ -14,8 +14,8 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
-from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals
-from ..raster import PictureGradients, PixelRegion, RasterSettings, pixel_region
+from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals, window_mask
+from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
@@ -28,6 +28,7 @@ LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
 BEND = 0.002  # RMS deviation from a plane, relative to the depth, above which a patch is halved: a tenth of SAME_DEPTH
 MAXIMUM_SLANT = 4.0  # cap on the 1/cos θ stretch of grazing surfaces, which noise of their normals would make endless
 THICKNESS = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
+NEEDED = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out: 2 to 8 % of them
 HOLD = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
 LOOKS = 12  # painted views that colours are corrected by; more gain nothing that is measured
 
@@ -40,11 +41,11 @@ class SeedSettings:
     largest: Annotated[int, Between(1, 64)] = 4  # px, a power of two, side of a patch; fewer splats (paper: 1 px each)
     detail: float = 20.0  # squared grey levels × px that a patch may vary by; fewer splats against sharp ones
     opacity: Annotated[float, Between(0.01, 0.999)] = 0.98  # of new splats; what they hide against gradients to refine
-    corrections: int = 1  # steps of least squares; time against seams and too dark views
+    corrections: int = 1  # steps of least squares, 0: all stay as seeded (paper); time against seams and dark views
     sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new splats; size against gloss
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
-    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
+    harmonics: HarmonicsSettings = HarmonicsSettings(offset=True)
     grey: float = 0.5  # of white, what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
 
 
@@ -255,7 +256,7 @@ def settle_gaussians(
     painted: Sequence[PaintedView],
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
-    """The new Gaussians, with colours such that the scene, drawn, shows the painted views.
+    """The new Gaussians that show somewhere, with colours such that the scene, drawn, shows the painted views.
 
     Splats overlap one another and the rim, so a splat in its pixel's colour does not draw that pixel. A picture is
     linear in the colours c, pixels = W c + known; one gradient step of least squares, scaled by W's column sums
@@ -265,6 +266,16 @@ def settle_gaussians(
     """
     others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
     looks = others[:: max(1, math.ceil(len(others) / LOOKS))]
+    if not settings.corrections:
+        return new
+    joined = scene.extended(new)
+
+    def peak(camera: Camera) -> np.ndarray:
+        there = window_mask(touched_window(new, camera), camera)
+        return contributions(joined, camera, pixels=there).peak[len(scene) :]
+
+    peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
+    new = new.take(np.max(peaks, axis=0) >= NEEDED)
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(partial(_colour_step, scene, new), looks)
         towards = [directions(new.means.astype(np.float64), view) for view, _ in looks]

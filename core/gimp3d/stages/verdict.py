@@ -26,6 +26,9 @@ from .masks import ViewMasks
 from .propagate import Reference
 from .witness import Says, Witness, ask
 
+VIEWS = 8  # that are looked at, spread evenly
+POINTS = 24_000  # pixels of the object in these views
+RING = 24  # px round the object
 EDGE = 3  # px next to the object that are mixed
 SCATTER = 4.0  # median distances of the drawn surface from a chart, from which something is before the chart
 UNLIKE = 24.0  # grey levels from which the object differs from what is behind it
@@ -37,17 +40,8 @@ FINE = 2.0  # px, σ of the blur that leaves no detail
 
 
 @dataclass(frozen=True)
-class VerdictSettings:
-    """How closely it is looked at."""
-
-    views: int = 8
-    points: int = 24_000  # pixels of the object in these views
-    ring: int = 24  # px round the object
-
-
-@dataclass(frozen=True)
 class Verdict:
-    """What the removal is worth (CONTRACT: verdict). None: there is nothing that tells."""
+    """What the removal is worth (docs/method.md, the verdict). None: there is nothing that tells."""
 
     score: float  # 0 bad … 1 good
     open_share: float  # of the hole's pixels
@@ -109,7 +103,6 @@ def judge(
     charts: Sequence[Chart] = (),
     hits: Mapping[str, Hits] | None = None,  # by ID
     given: Reference | None = None,  # that a picture was given for
-    settings: VerdictSettings = VerdictSettings(),
 ) -> Verdict | None:
     """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
     kept = scene.take(keep)
@@ -120,12 +113,12 @@ def judge(
     showing = [v for v in asked if v.silhouette.any()]
     if not showing:
         return None
-    count = min(settings.views, len(showing))
+    count = min(VIEWS, len(showing))
 
     def look(view: ViewMasks) -> _Look:
         photo = photos[view.camera.id].astype(np.float32)
         away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
-        near, around = away <= settings.ring, away > EDGE
+        near, around = away <= RING, away > EDGE
         beside = around & (away <= _reach(away[around], int(view.silhouette.sum())))
         before = _drawn(scene, view.camera, (near & around) | beside)
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
@@ -151,7 +144,7 @@ def judge(
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
     total = sum(int(look.view.silhouette.sum()) for look in looks)
-    step = max(1, round(math.sqrt(total / settings.points)))
+    step = max(1, round(math.sqrt(total / POINTS)))
     tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
     samples = parallel_map(lambda x: _sampled(x, step, witnesses, tolerance, given), looks)
     return _summed(looks, samples, still_open, views, bool(photographed), bool(charts))
@@ -372,36 +365,25 @@ def _words(v: Verdict) -> tuple[str, ...]:
     """What it comes to; then, of each thing that is amiss, how much, and what to do."""
     level = "good" if v.score >= GOOD else "fair" if v.score >= FAIR else "poor"
     times = 10 ** (v.expected_error / 20)
-    detail = 1.0 if v.sharpness is None else v.sharpness
-    amiss = (
-        (
-            v.open_share > 0.02,
-            f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best",
-        ),
-        (
-            v.remains > 0.05,
-            f"{v.remains:.0%} of the object's place still looks like it: enlarge the box until all of it is inside",
-        ),
-        (
-            (v.haze or 0) > 0.05,
-            f"haze covers {v.haze or 0:.0%} of what was behind the object: enlarge the box, or add one round the haze",
-        ),
-        (
-            (v.ring_fidelity or 0) < -0.5,
-            f"the surroundings lost {-(v.ring_fidelity or 0):.1f} dB against the photos: make the box tighter",
-        ),
-        (
-            not 0.5 < detail < 2,
-            f"the fill has {detail:.1f} times the detail of its surroundings: paint one view, or try another seed",
-        ),
-        (
-            v.agreement is not None and v.agreement < 0.7,
-            f"only {v.agreement or 0:.0%} of the object's place looks as photos show it: mark shadows and reflections",
-        ),
-        (
-            v.invented > 0.3,
-            f"no photo shows {v.invented:.0%} of the object's place: paint one view if the fill does not convince",
-        ),
-    )
-    first = f"{level}: errors where the object was are probably {times:.1f} times those round it"
-    return (first, *(words for wrong, words in amiss if wrong))
+    words = [f"{level}: errors where the object was are probably {times:.1f} times those round it"]
+    if v.open_share > 0.02:
+        words.append(f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best")
+    if v.remains > 0.05:
+        place = f"{v.remains:.0%} of the object's place still looks like it"
+        words.append(f"{place}: enlarge the box until all of it is inside")
+    if v.haze is not None and v.haze > 0.05:
+        haze = f"haze covers {v.haze:.0%} of what was behind the object"
+        words.append(f"{haze}: enlarge the box, or add one round the haze")
+    if v.ring_fidelity is not None and v.ring_fidelity < -0.5:
+        lost = f"the surroundings lost {-v.ring_fidelity:.1f} dB against the photos"
+        words.append(f"{lost}: make the box tighter")
+    if v.sharpness is not None and not 0.5 < v.sharpness < 2:
+        detail = f"the fill has {v.sharpness:.1f} times the detail of its surroundings"
+        words.append(f"{detail}: paint one view, or try another seed")
+    if v.agreement is not None and v.agreement < 0.7:
+        alike = f"only {v.agreement:.0%} of the object's place looks as photos show it"
+        words.append(f"{alike}: mark shadows and reflections")
+    if v.invented > 0.3:
+        unknown = f"no photo shows {v.invented:.0%} of the object's place"
+        words.append(f"{unknown}: paint one view if the fill does not convince")
+    return tuple(words)

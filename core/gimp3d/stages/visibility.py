@@ -1,6 +1,6 @@
 """What the views together have seen of the scene: each point of space is judged once, whichever view asks.
 
-That makes target regions consistent between views by construction (METHOD section 1).
+That makes target regions consistent between views by construction.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
-from ..geometry import Window, framed, pack_camera, project, surface_points
+from ..geometry import SAME_DEPTH, Window, framed, pack_camera, project, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
 HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
@@ -63,7 +63,7 @@ def depth_agreement(
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
     windows: Sequence[Window],  # the parts to look at
-    tolerance: float,  # relative z
+    tolerance: float = SAME_DEPTH,  # relative z
     samples: int = 1000,  # per view
 ) -> float:
     """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.

@@ -201,7 +201,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
     means = seeds.means.astype(float)
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
-    loose = SeedSettings(harmonics=HarmonicsSettings(floor=0.01, offset=True))
+    loose = SeedSettings(harmonics=HarmonicsSettings(ridge=0.01, offset=True))
     coloured = colour_gaussians(seeds, reference, everywhere, painted, 3, loose)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9
@@ -329,6 +329,18 @@ def test_the_papers_constant_lacks_what_3dgs_adds() -> None:
     ours, papers = (colour_gaussians(seeds, camera, [], [], 2, SeedSettings(grey=g)) for g in (0.5, 0.0))
     np.testing.assert_allclose(papers.sh[:, 0] - ours.sh[:, 0], 0.5 / SH_C0, rtol=1e-5)
     np.testing.assert_allclose(ours.sh[:, 0], seeds.sh[:, 0], atol=1e-6)  # float32, there and back
+
+
+def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
+    views, painted = _hole_and_truth()
+    view = views[1]
+    seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
+    below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
+    seen_from = [v.camera for v in views]
+    new = settle_gaussians(truth(), below, view.camera, seen_from, painted)
+    assert len(new) < 0.1 * len(below)  # the floor hides them
+    everything = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
+    assert np.array_equal(everything.means, below.means)
 
 
 def test_a_patch_size_that_cannot_be_halved_is_refused() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
-from ...geometry import bounds, cropped
+from ...geometry import EVIDENCE_DEPTH, bounds, cropped
 from ...progress import Progress, silent
 from ...solvers.colours import NO_CHANGE
 from .blend import blend_band, to_bytes
@@ -43,7 +43,6 @@ BLENDS = ("band", "rim")
 SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area
 LEAST_REACH = 16  # px of that
 BAND = 1 / 8  # of that: the strip round the hole that the blend is fitted to most
-EVIDENCE = 0.006  # relative z within which the photo's own surface is the new one, so that it need not be painted
 
 
 def near_hole(target: np.ndarray) -> tuple[slice, slice]:
@@ -145,5 +144,5 @@ def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
 
 def _same_surface(view: ViewToPaint) -> np.ndarray:
     """[H, W] bool: the photo's surface is the new one."""
-    near = np.abs(view.depth_before - view.depth_new) < EVIDENCE * view.depth_new
+    near = np.abs(view.depth_before - view.depth_new) < EVIDENCE_DEPTH * view.depth_new
     return (view.depth_before > 0) & (view.depth_new > 0) & near
