@@ -33,7 +33,7 @@ from gimp3d.priors.monodepth import DepthPrior
 from gimp3d.raster import RasterSettings, render, surface_depth
 from gimp3d.solvers.poisson import solve_poisson
 from gimp3d.stages.depth import DepthSettings, complete_depth, complete_disparity, fit_prior
-from gimp3d.stages.layers import distance_to
+from gimp3d.stages.depth.layers import distance_to
 from gimp3d.stages.masks import ViewMasks, find_masks
 from gimp3d.stages.reference import rim
 

@@ -11,7 +11,6 @@ from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
 from .stages.evidence import EvidenceSettings
-from .stages.layers import LayerSettings
 from .stages.mapping import MappingSettings
 from .stages.masks import MaskSettings
 from .stages.propagate import PropagateSettings
@@ -54,12 +53,10 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(
-            largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
-        ),
+        seed=SeedSettings(largest=1, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
         refine=RefineSettings(steps=3000, patience=120),
         shadow="off",
         use_evidence=False,

@@ -7,33 +7,26 @@ slope: on curved ground its error is a half to a quarter of a membrane's, measur
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ..schema import Many, Positive
+from ..geometry import bounds
 
-
-@dataclass(frozen=True)
-class ThinPlateSettings:
-    """How stiff the plate is."""
-
-    smoothing: Positive = 1.5  # px, σ below which the values' own noise is smoothed away
-    tension: Positive = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
-    unknowns: Many = 4000  # at most; larger domains are solved on a coarser grid
-    stiff: Positive = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
-    outlier: Positive = 4.7  # standard deviations off the stiff plate at which a value does not count; inf: all count
+SMOOTHING = 1.5  # px, σ below which the values' own noise is smoothed away
+TENSION = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
+UNKNOWNS = 4000  # at most; larger domains are solved on a coarser grid
+STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
+OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
 
 
 def thin_plate(
     values: np.ndarray,  # [H, W]
     weight: np.ndarray,  # [H, W] ≥ 0, how much each value counts; 0 = unknown
     wanted: np.ndarray,  # [H, W] bool, where the surface is asked for
-    settings: ThinPlateSettings = ThinPlateSettings(),
+    unknowns: int = UNKNOWNS,  # at most
 ) -> np.ndarray:
     """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
 
@@ -46,33 +39,26 @@ def thin_plate(
     result = np.full(domain.shape, np.nan)
     if not (weight > 0).any():
         return result
-    window = _window(domain)
+    window = bounds(domain)
     domain, weight = domain[window], weight[window]
     # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
     trend = _slope(values[window], weight)
-    stride = int(np.ceil(np.sqrt(domain.sum() / settings.unknowns)))
+    stride = int(np.ceil(np.sqrt(domain.sum() / unknowns)))
     count = _cells(weight, stride)
     mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
     cells = _cells(domain.astype(np.float64), stride) > 0
     parts, _ = scipy.ndimage.label(cells)
     cells &= np.isin(parts, parts[count > 0])
     radius = max(np.sqrt(wanted.sum() / np.pi), 1.0)
-    pull = (settings.tension * radius / stride) ** -2
-    coarse, weights = np.full(cells.shape, np.nan), count
-    if np.isfinite(settings.outlier):
-        stiff = _energy(cells, settings.stiff**4 / stride**2, pull)
-        coarse[cells] = _minimum(stiff, count[cells], mean[cells])
-        weights = count * _biweight(coarse - mean, count > 0, settings.outlier)
-    coarse[cells] = _minimum(_energy(cells, settings.smoothing**4 / stride**2, pull), weights[cells], mean[cells])
+    pull = (TENSION * radius / stride) ** -2
+    coarse = np.full(cells.shape, np.nan)
+    coarse[cells] = _minimum(_energy(cells, STIFF**4 / stride**2, pull), count[cells], mean[cells])
+    weights = count * _biweight(coarse - mean, count > 0)
+    coarse[cells] = _minimum(_energy(cells, SMOOTHING**4 / stride**2, pull), weights[cells], mean[cells])
     fine = _refined(coarse, cells, stride)[: domain.shape[0], : domain.shape[1]]
     inside = domain & np.repeat(np.repeat(cells, stride, 0), stride, 1)[: domain.shape[0], : domain.shape[1]]
     result[window] = np.where(inside, fine + trend, np.nan)
     return result
-
-
-def _window(domain: np.ndarray) -> tuple[slice, slice]:
-    rows, cols = np.flatnonzero(domain.any(1)), np.flatnonzero(domain.any(0))
-    return slice(rows[0], rows[-1] + 1), slice(cols[0], cols[-1] + 1)
 
 
 def _slope(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -125,10 +111,10 @@ def _minimum(energy: scipy.sparse.csr_matrix, weight: np.ndarray, values: np.nda
     return factors.solve(weight * values)
 
 
-def _biweight(residual: np.ndarray, there: np.ndarray, outlier: float) -> np.ndarray:
-    """Tukey's weights of the residuals (95 % efficient at 4.7); never 0, lest a part of the domain lose all."""
+def _biweight(residual: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Tukey's weights of the residuals ; never 0, lest a part of the domain lose all."""
     scale = 1.4826 * float(np.median(np.abs(residual[there])))
-    share = np.where(there, np.abs(residual), 0.0) / (outlier * scale + 1e-300)
+    share = np.where(there, np.abs(residual), 0.0) / (OUTLIER * scale + 1e-300)
     return np.maximum(1 - np.minimum(share, 1.0) ** 2, 1e-3) ** 2
 
 

@@ -32,7 +32,7 @@ def map_reference(completed: Completed, views: Sequence[ViewState], settings: Re
     """Where each pixel of the reference's hole has its like, in what the views show."""
     c = completed
     seen = [(v.camera, v.left.depth_before, v.left.silhouette) for v in views]
-    visibility = source_visibility(c.camera, c.depth, seen, settings.mapping)
+    visibility = source_visibility(c.camera, c.depth, seen)
     return mapping_field(
         c.appearance.image,
         c.target,
@@ -63,7 +63,7 @@ def paint_views(
     def load(view: ViewState) -> ViewToPaint:
         if completed.charts:
             return _on_charts(view, completed.charts)
-        return _as_drawn(view, with_seeds, settings)
+        return _as_drawn(view, with_seeds)
 
     loaders = [partial(load, v) for v in views]
     return propagate(as_reference(completed, field), loaders, settings.propagate, progress)
@@ -115,11 +115,11 @@ def _on_charts(view: ViewState, charts: Sequence[Chart]) -> ViewToPaint:
     return ViewToPaint(v.camera, view.bare, view.painted, v.silhouette, v.target, before, after)
 
 
-def _as_drawn(view: ViewState, with_seeds: Gaussians, settings: RemovalSettings) -> ViewToPaint:
+def _as_drawn(view: ViewState, with_seeds: Gaussians) -> ViewToPaint:
     """The view with the depth of its splats, the new ones among them."""
     v = view.left
     after = np.zeros_like(v.depth_before)
     if v.target.any():
-        window = window_mask(near_hole(v.target, settings.propagate), v.camera)
+        window = window_mask(near_hole(v.target), v.camera)
         after = surface_depth(with_seeds, v.camera, pixels=window)[0]
     return ViewToPaint(v.camera, view.bare, view.painted, v.silhouette, v.target, v.depth_before, after)

@@ -164,7 +164,7 @@ def complete_view_depth(
         share = float((there[masks.target] > 0).mean())
         known, no_ring = np.ones(depth.shape, np.float32), np.zeros((0, 2), np.float32)
         words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(disparity_of(depth), depth, known, 0.0, no_ring, (0.0, 0.0), 0, 0, share, words)
+        return DepthCompletion(disparity_of(depth), depth, known, 0.0, no_ring, (0.0, 0.0), 0, share, words)
     looked_at, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:
         spec = "auto"

@@ -1,4 +1,4 @@
-"""The mapping field: which source patch of the reference explains each filled one (paper 3.3, METHOD 4)."""
+"""The mapping field: which source patch of the reference explains each filled one (paper 3.3; docs/method.md)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
-from ..geometry import disparity_of
-from ..schema import Share, Signed
+from ..geometry import SAME_DEPTH, disparity_of, pack_camera, project
+from ..schema import Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
 
@@ -22,10 +22,9 @@ MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has f
 class MappingSettings:
     """How sources are judged."""
 
-    visibility: Signed = 0.002  # λ_v, cost of a source that no view sees, (11 grey levels)²; sign mended
-    depth_tolerance: Share = 0.02  # z-test of visibility, relative
-    geometry: bool = True  # patches lie on the surface (METHOD section 4); the paper's lie in the picture
-    as_printed: bool = False  # patches are compared at f(p) and copied from p + f(p): the paper's cost misses p
+    visibility: Signed = 0.002  # squared colour difference, λ_v of eq. 8, (11 grey levels)²; likeness, what views see
+    geometry: bool = True  # patches lie on the surface; the paper's lie in the picture
+    as_printed: bool = False  # compared at f(p), copied from p + f(p); nothing: the paper's cost misses p
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
 
@@ -45,28 +44,17 @@ def source_visibility(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z-depth of the reference, 0 = nothing
     views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, hidden pixels)
-    settings: MappingSettings = MappingSettings(),
 ) -> np.ndarray:
     """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden.
 
     One pass per view; nothing is kept of a view but its count.
     """
-    height, width = depth.shape
-    count = np.zeros((height, width), np.int32)
-    here = np.ascontiguousarray(depth, np.float32)
-    for other, there, hidden in views:
-        run_ranges(
-            _count_seen,
-            height,
-            here,
-            np.linalg.inv(camera.K),
-            other.K @ (other.R @ camera.R.T),
-            other.K @ (other.t - other.R @ camera.R.T @ camera.t),
-            np.ascontiguousarray(there, np.float32),
-            np.ascontiguousarray(hidden, bool),
-            settings.depth_tolerance,
-            count,
-        )
+    count = np.zeros(depth.shape, np.int32)
+    here, back = np.ascontiguousarray(depth, np.float32), np.linalg.inv(camera.viewmat)
+    for other, z, hidden in views:
+        as_seen = pack_camera(replace(other, viewmat=other.viewmat @ back))  # from the reference's axes
+        there = np.ascontiguousarray(z, np.float32), np.ascontiguousarray(hidden, bool)
+        run_ranges(_count_seen, len(depth), here, np.linalg.inv(camera.K), as_seen, *there, SAME_DEPTH, count)
     return (count / max(1, len(views))).astype(np.float32)
 
 
@@ -96,10 +84,8 @@ def mapping_field(
     if not target.any():
         confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
     elif not found.any():
-        confidence, reason = (
-            0.0,
-            "no source patch: the reference shows nothing but the hole; its own colours are warped",
-        )
+        confidence = 0.0
+        reason = "no source patch: the reference shows nothing but the hole; its own colours are warped"
     else:
         rows, cols = nearest.rows[found], nearest.cols[found]
         appearance = (nearest.cost[found] - penalty[rows, cols]) / (1 - patchmatch.coherence)
@@ -122,12 +108,11 @@ def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> Near
 
 
 @exact_kernel
-def _count_seen(lo, hi, depth, inverse, turn, shift, there, hidden, tolerance, count):
+def _count_seen(lo, hi, depth, inverse, other, there, hidden, tolerance, count):
     """Add one to every pixel of rows [lo, hi) whose point is the surface that the other view shows there.
 
-    `inverse` is K⁻¹ of the reference; `turn` and `shift` take its camera axes to the other view's pixels.
+    `inverse` is K⁻¹ of the reference, `other` the packed view in its camera axes.
     """
-    h, w = there.shape
     for i in range(lo, hi):
         for j in range(depth.shape[1]):
             z = float(depth[i, j])
@@ -135,13 +120,9 @@ def _count_seen(lo, hi, depth, inverse, turn, shift, there, hidden, tolerance, c
                 continue
             x = (inverse[0, 0] * (j + 0.5) + inverse[0, 2]) * z
             y = (inverse[1, 1] * (i + 0.5) + inverse[1, 2]) * z
-            zt = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
-            if zt <= 0:
-                continue
-            u = (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]) / zt
-            v = (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]) / zt
-            if not (0 <= u < w and 0 <= v < h):
+            u, v, seen = project(other, x, y, z)
+            if not (0 <= u < other[16] and 0 <= v < other[17]):
                 continue
             a, b = int(v), int(u)
-            if not hidden[a, b] and abs(there[a, b] - zt) < tolerance * zt:
+            if not hidden[a, b] and abs(there[a, b] - seen) < tolerance * seen:
                 count[i, j] += 1

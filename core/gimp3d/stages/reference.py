@@ -13,14 +13,14 @@ from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
 from ..schema import Many
-from ..solvers.thin_plate import ThinPlateSettings
+from ..solvers.planes import RING
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks
 
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
 MOST_EXTRA = 8  # further references that a plan looks ahead
 # Where the hidden surface is, about: coarse and fast.
-PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000), small_part=300)
+PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 
     A surface that is only sampled need not be completed at every pixel.
     """
-    margin = step * (PROVISIONAL.planes.ring + 2)
+    margin = step * (RING + 2)
     rows, cols = (slice(s.start, s.stop, step) for s in bounds(view.target, margin))
     height, width = view.target[rows, cols].shape
     c = view.camera

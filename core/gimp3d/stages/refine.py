@@ -1,4 +1,4 @@
-"""Optimising the new Gaussians so that every view shows what was painted into it (paper 3.4, METHOD section 7)."""
+"""Optimising the new Gaussians so that every view shows what was painted into it (paper 3.4; docs/method.md)."""
 
 from __future__ import annotations
 
@@ -13,37 +13,33 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import bounds, dilated
 from ..progress import Progress, silent
 from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_region
-from ..schema import AtLeastOne, Between, Share
+from ..schema import AtLeastOne, Between
 from .propagate import Rule
 
 V = TypeVar("V")
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
-C1, C2 = 0.01**2, 0.03**2
+STEADY, STEADIER = 0.01**2, 0.03**2  # SSIM's C1 and C2, by which dark and flat parts count little
+SSIM = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
+NORMAL, DISTORTION = 0.05, 10.0  # weights of normal consistency and depth distortion, surfels only (Huang 2024)
+MARGIN = 4  # px of known picture round the target that counts as well: no visible seam
+HELD_OUT = 8  # every so many views is not learned from; it says when to stop
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
+# Its learning rates: 3DGS's, those of shapes lower as there are few steps; of means in the Gaussians' median size.
+RATES = {"means": 0.02, "log_scales": 0.005, "quats": 0.001, "opacity_logits": 0.02}
+COLOUR, VIEW_DEPENDENCE = 0.0025, 0.000125
 
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """How the new Gaussians are optimised. Lengths in pixels."""
+    """How long the new Gaussians are optimised."""
 
-    steps: Annotated[int, Between(0, 1_000_000)] = 0  # one view each; 0: the closed form is final
-    views: AtLeastOne = 48  # as many of the painted ones at most: each holds its part of the scene in memory
-    ssim: Share = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
-    margin: int = 4  # of known picture round the target that counts as well: no visible seam
-    held_out: Annotated[int, Between(2, 1000)] = 8  # every so many views is not learned from; it says when to stop
-    check: AtLeastOne = 25  # steps between two looks at the held-out views
-    patience: AtLeastOne = 2  # looks without an improvement before it stops
-    # Learning rates of Adam; that of means is in units of the Gaussians' median size, per step
-    rate_means: float = 0.02
-    rate_scales: float = 0.005
-    rate_quats: float = 0.001
-    rate_opacity: float = 0.02
-    rate_colour: float = 0.0025
-    rate_view_dependence: float = 0.000125
-    normal: float = 0.05  # weight of normal consistency, surfels only (Huang 2024)
-    distortion: float = 10.0  # weight of depth distortion, surfels only
+    steps: Annotated[int, Between(0, 1_000_000)] = 0  # of one view each, 0: the closed form is final; time against dB
+    views: AtLeastOne = 48  # of the painted ones, at most; memory against what the others show
+    check: AtLeastOne = 25  # steps between two looks at the held-out views; time against the best moment to stop
+    patience: AtLeastOne = 2  # looks without an improvement before it stops; time against a late improvement
 
 
 @dataclass(frozen=True)
@@ -106,16 +102,16 @@ def refine_gaussians(
 ) -> Refinement:
     """Adam on the new Gaussians alone, over the tiles that the targets cover; the rest of the scene does not move.
 
-    Every `held_out`-th view is left out of the gradient. The state that it likes best is kept, so the result is never
+    Every HELD_OUT-th view is left out of the gradient. The state that it likes best is kept, so the result is never
     worse there than the start. Without steps, views or new Gaussians the input is returned.
     """
     seen = looked_at([o for o in observations if (o.weight[o.target] > 0).any()], settings)
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
-    views = parallel_map(lambda o: _View(frozen, o, settings), seen)
-    judges = views[settings.held_out // 2 :: settings.held_out] or views[:1]
+    views = parallel_map(lambda o: _View(frozen, o), seen)
+    judges = views[HELD_OUT // 2 :: HELD_OUT] or views[:1]
     learners = [v for v in views if v not in judges] or views
-    state = _State(new, settings)
+    state = _State(new)
     rng = np.random.default_rng(seed)
 
     def judged() -> float:
@@ -147,17 +143,11 @@ def refine_gaussians(
 class _State:
     """The new Gaussians on their way: Adam (Kingma 2015)."""
 
-    def __init__(self, new: Gaussians, settings: RefineSettings) -> None:
+    def __init__(self, new: Gaussians) -> None:
         size = float(np.exp(np.median(new.log_scales)))
-        colour = np.full((new.sh.shape[1], 1), settings.rate_view_dependence, np.float32)
-        colour[0] = settings.rate_colour
-        self.rates: dict[str, float | np.ndarray] = {
-            "means": settings.rate_means * size,
-            "log_scales": settings.rate_scales,
-            "quats": settings.rate_quats,
-            "opacity_logits": settings.rate_opacity,
-            "sh": colour,
-        }
+        colour = np.full((new.sh.shape[1], 1), VIEW_DEPENDENCE, np.float32)
+        colour[0] = COLOUR
+        self.rates: dict[str, float | np.ndarray] = {**RATES, "means": RATES["means"] * size, "sh": colour}
         self.gaussians = replace(new, **{name: getattr(new, name).copy() for name in self.rates})
         self.moments = {name: np.zeros((2, *getattr(new, name).shape), np.float32) for name in self.rates}
         self.steps = 0
@@ -181,18 +171,12 @@ class _State:
 class _View:
     """A view's part of the loss: what does not change between steps is prepared once."""
 
-    def __init__(self, frozen: Gaussians, observation: Observation, settings: RefineSettings) -> None:
-        self.settings, self.surfels, self.camera = settings, frozen.is_surfels, observation.camera
-        size = 2 * settings.margin + 1
-        counted = cv2.dilate(observation.target.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    def __init__(self, frozen: Gaussians, observation: Observation) -> None:
+        self.surfels, self.camera = frozen.is_surfels, observation.camera
+        counted = dilated(observation.target, MARGIN)
         passes = {"rgb", "alpha"} | ({"normal", "distortion", "expected_depth"} if self.surfels else set())
         self.region: PixelRegion = pixel_region(frozen, observation.camera, counted, passes=frozenset(passes))
-        rows, cols = np.flatnonzero(counted.any(1)), np.flatnonzero(counted.any(0))
-        half = WINDOW // 2
-        self.window = (
-            slice(max(rows[0] - half, 0), rows[-1] + half + 1),
-            slice(max(cols[0] - half, 0), cols[-1] + half + 1),
-        )
+        self.window = bounds(counted, WINDOW // 2)
         # Round the target the photo itself counts fully.
         weight = (np.where(observation.target, observation.weight, 1.0) * counted)[self.window]
         self.share = (weight / weight.sum()).astype(np.float32)  # of each pixel in the loss
@@ -216,18 +200,17 @@ class _View:
         rgb = np.where(self.counted[..., None], np.clip(part, 0, 1), self.image)
         off, share = rgb - self.image, self.share[..., None] / 3
         likeness, uphill = self._ssim(rgb, share)
-        ssim = self.settings.ssim
-        loss = (1 - ssim) * float((np.abs(off) * share).sum()) + ssim * float(((1 - likeness) * share).sum())
-        slope = (1 - ssim) * np.sign(off) * share - ssim * uphill
+        loss = (1 - SSIM) * float((np.abs(off) * share).sum()) + SSIM * float(((1 - likeness) * share).sum())
+        slope = (1 - SSIM) * np.sign(off) * share - SSIM * uphill
         slopes = {"rgb": slope * (self.counted[..., None] & (part >= 0) & (part <= 1))}
         if self.rays is not None:
             normals, depth = drawn.normals[self.window], drawn.expected_depth[self.window]
             across, normals_slope, depth_slope = _misalignment(normals, depth, self.rays, self.share)
-            loss += self.settings.normal * across
-            loss += self.settings.distortion * float((drawn.distortion[self.window] * self.share).sum())
-            slopes["normals"] = self.settings.normal * normals_slope
-            slopes["expected_depth"] = self.settings.normal * depth_slope
-            slopes["distortion"] = self.settings.distortion * self.share
+            loss += NORMAL * across
+            loss += DISTORTION * float((drawn.distortion[self.window] * self.share).sum())
+            slopes["normals"] = NORMAL * normals_slope
+            slopes["expected_depth"] = NORMAL * depth_slope
+            slopes["distortion"] = DISTORTION * self.share
         return loss, PictureGradients(**{name: self._whole(values) for name, values in slopes.items()})
 
     def _whole(self, values: np.ndarray) -> np.ndarray:
@@ -239,9 +222,9 @@ class _View:
     def _ssim(self, rgb: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The SSIM map [h, w, 3] (Wang 2004), and the gradient of Σ share · SSIM with respect to rgb."""
         mean, square, product = _blurred(rgb), _blurred(rgb * rgb), _blurred(rgb * self.image)
-        brightness = mean**2 + self.mean**2 + C1
-        contrast = square - mean**2 + self.variance + C2
-        alike, together = 2 * mean * self.mean + C1, 2 * (product - mean * self.mean) + C2
+        brightness = mean**2 + self.mean**2 + STEADY
+        contrast = square - mean**2 + self.variance + STEADIER
+        alike, together = 2 * mean * self.mean + STEADY, 2 * (product - mean * self.mean) + STEADIER
         ssim = alike * together / (brightness * contrast)
         by_product = 2 * share * alike / (brightness * contrast)
         by_square = -share * ssim / contrast

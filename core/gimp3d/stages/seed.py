@@ -1,4 +1,4 @@
-"""New Gaussians from the completed reference, and their colours from every view (paper supplementary, METHOD 6)."""
+"""New Gaussians from the completed reference, and their colours from every view (paper, supplementary material)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
-from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
-from ..geometry import cropped, sees, surface_normals, window_mask
+from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
+from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
-from ..schema import AtLeastOne, Between, Positive, Share
+from ..schema import Between, Positive
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
 from .propagate import PaintedView, Rule
@@ -25,31 +25,28 @@ OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a v
 SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all
 CUT = 9.0  # of the usual miss of a view at a Gaussian (6 σ): what is missed by more is a wrong picture
 LEAST_SIGMA = 0.2  # px, of a splat that stands for one pixel
+BEND = 0.002  # RMS deviation from a plane, relative to the depth, above which a patch is halved: a tenth of SAME_DEPTH
+MAXIMUM_SLANT = 4.0  # cap on the 1/cos θ stretch of grazing surfaces, which noise of their normals would make endless
+THICKNESS = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
+NEEDED = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out: 2 to 8 % of them
+HOLD = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
+LOOKS = 12  # painted views that colours are corrected by; more gain nothing that is measured
 
 
 @dataclass(frozen=True)
 class SeedSettings:
     """How the completed reference becomes Gaussians."""
 
-    spread: Positive = 0.75  # standard deviation on screen, low-pass included, in sides of the splat's patch
-    # px, a power of two: the longest side of a patch; 1: one Gaussian per pixel (paper)
-    largest: Annotated[int, Between(1, 64)] = 4
-    detail: float = 20.0  # squared grey levels × px, summed over channels: a patch whose colours vary more is halved
-    bend: float = 0.002  # RMS deviation from a plane, relative to the depth, above which a patch is halved
-    maximum_slant: Annotated[float, Between(1)] = 4.0  # cap on the 1/cos θ stretch of grazing surfaces
-    thickness: Positive = 0.1  # standard deviation along the normal, as a share of the smaller tangential one
-    opacity: Annotated[float, Between(0.01, 0.999)] = 0.98
-    sink: float = 0.25  # depth under the surface, in standard deviations; see settle_gaussians
-    needed: Share = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out
-    corrections: int = 1  # steps by which colours are corrected so that the scene, drawn, shows the painted views
-    hold: float = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
-    looks: AtLeastOne = 12  # painted views that both of these are judged by
-    sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new Gaussians; each gets what its observations support
+    spread: Positive = 0.75  # sides of a patch, σ of its splat on screen; smooth against sharp
+    largest: Annotated[int, Between(1, 64)] = 4  # px, a power of two, side of a patch; fewer splats (paper: 1 px each)
+    detail: float = 20.0  # squared grey levels × px that a patch may vary by; fewer splats against sharp ones
+    opacity: Annotated[float, Between(0.01, 0.999)] = 0.98  # of new splats; what they hide against gradients to refine
+    corrections: int = 1  # steps of least squares, 0: all stay as seeded (paper); time against seams and dark views
+    sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new splats; size against gloss
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
     harmonics: HarmonicsSettings = HarmonicsSettings(offset=True)
-    grey: float = 0.5  # what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
-    depth_tolerance: Share = 0.02  # z-test of observations
+    grey: float = 0.5  # of white, what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
 
 
 def seed_gaussians(
@@ -86,7 +83,7 @@ def seed_gaussians(
     rays = np.concatenate([(uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones((len(z), 1))], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     # How far the plane moves for one pixel in the picture; along n·X = const, X = z·ray and z ~ 1 / (n·ray).
-    towards = np.minimum((normal * rays).sum(-1), -np.linalg.norm(rays, axis=-1) / settings.maximum_slant)
+    towards = np.minimum((normal * rays).sum(-1), -np.linalg.norm(rays, axis=-1) / MAXIMUM_SLANT)
     steps = np.diag([1 / camera.fx, 1 / camera.fy, 0])[:2]
     slopes = normal @ steps.T / towards[:, None]
     tangents = z[..., None] * (steps[None] - slopes[..., None] * rays[:, None])  # [N, 2, 3]
@@ -98,7 +95,7 @@ def seed_gaussians(
     sigma = np.sqrt(np.maximum((settings.spread * sides) ** 2 - low_pass, LEAST_SIGMA**2))
     axes, scales, _ = np.linalg.svd(np.swapaxes(sigma * tangents, 1, 2), full_matrices=False)
     frame = np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], -1)  # columns: axes in the camera
-    scales = np.concatenate([scales, settings.thickness * scales[:, 1:]], -1)
+    scales = np.concatenate([scales, THICKNESS * scales[:, 1:]], -1)
     return Gaussians(
         means=camera.unproject(uv, z[:, 0]).astype(np.float32),
         log_scales=np.log(scales[:, : 2 if surfels else 3]).astype(np.float32),
@@ -143,7 +140,7 @@ def _patches(
         pending = pending[tables.covered(pending) > 0]
         misfit = tables.misfit(pending)
         bend = np.sqrt(misfit[:, 3] / pending[:, 2:].prod(1)) * pending[:, 2:].prod(1) / tables.sums(pending)[:, 3]
-        fine = (misfit[:, :3].sum(1) <= settings.detail) & (bend <= settings.bend) & tables.inside(pending)
+        fine = (misfit[:, :3].sum(1) <= settings.detail) & (bend <= BEND) & tables.inside(pending)
         fine |= pending[:, 2:].prod(1) == 1
         done.append(pending[fine])
         pending = _halved(pending[~fine], tables)
@@ -242,10 +239,10 @@ def colour_gaussians(
     sh = seeds.sh
     if degree > 0:
         means = seeds.means.astype(np.float64)
-        seen = parallel_map(lambda pair: _seen_in(means, *pair, settings.depth_tolerance), zip(views, painted))
+        seen = parallel_map(lambda pair: _seen_in(means, *pair), zip(views, painted))
         colours = 0.5 + SH_C0 * sh[:, 0].astype(np.float64)
         observations = gather_observations(len(seeds), seen)
-        sh = fit_harmonics(colours, _towards(means, reference), observations, degree, settings.harmonics).sh
+        sh = fit_harmonics(colours, directions(means, reference), observations, degree, settings.harmonics).sh
     sh = pad_sh(sh, bands).copy()
     sh[:, 0] += (0.5 - settings.grey) / SH_C0
     return replace(seeds, sh=sh)
@@ -259,21 +256,18 @@ def settle_gaussians(
     painted: Sequence[PaintedView],
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
-    """The new Gaussians that are needed, with colours such that the scene, drawn, shows the painted views.
+    """The new Gaussians that show somewhere, with colours such that the scene, drawn, shows the painted views.
 
     Splats overlap one another and the rim, so a splat in its pixel's colour does not draw that pixel. A picture is
     linear in the colours c, pixels = W c + known; one gradient step of least squares, scaled by W's column sums
     (SIRT), takes most of what is missing. It is taken over views all round, and fits each Gaussian's coefficients to
     what each view misses: a step for the reference alone would undo, there, how near splats cover far ones, and double
     that on the other side.
-
-    That covering moves the texture away from whoever looks, by part of a splat. Splats a little under the surface move
-    it back, from all sides: parallax draws what is deeper nearer to the viewer's foot.
     """
     others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
-    stride = max(1, math.ceil(len(others) / max(1, settings.looks)))
-    looks = others[::stride]
-    new = _sunk(new, reference, settings.sink)
+    looks = others[:: max(1, math.ceil(len(others) / LOOKS))]
+    if not settings.corrections:
+        return new
     joined = scene.extended(new)
 
     def peak(camera: Camera) -> np.ndarray:
@@ -281,27 +275,15 @@ def settle_gaussians(
         return contributions(joined, camera, pixels=there).peak[len(scene) :]
 
     peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
-    new = new.take(np.max(peaks, axis=0) >= settings.needed)
+    new = new.take(np.max(peaks, axis=0) >= NEEDED)
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(partial(_colour_step, scene, new), looks)
-        towards = [_towards(new.means.astype(np.float64), view) for view, _ in looks]
-        change = _colour_change(steps, towards, min(settings.sh_degree, new.sh_degree), settings.hold)
+        towards = [directions(new.means.astype(np.float64), view) for view, _ in looks]
+        change = _colour_change(steps, towards, min(settings.sh_degree, new.sh_degree), HOLD)
         sh = new.sh.copy()
         sh[:, : change.shape[1]] += change
         new = replace(new, sh=sh)
     return new
-
-
-def _sunk(
-    gaussians: Gaussians,
-    reference: Camera,
-    depth: float,  # in standard deviations along the longest axis
-) -> Gaussians:
-    """Flat Gaussians moved along their normal, away from the reference."""
-    means = gaussians.means.astype(np.float64)
-    normals = quats_to_matrices(gaussians.quats.astype(np.float64))[:, :, 2]
-    normals *= np.sign((normals * (means - reference.centre)).sum(-1, keepdims=True))
-    return replace(gaussians, means=(means + depth * gaussians.scales[:, :1] * normals).astype(np.float32))
 
 
 def _colour_change(
@@ -357,21 +339,13 @@ def missing_colours(
     return weights / SH_C0, error / SH_C0**2
 
 
-def _seen_in(
-    means: np.ndarray, view: Camera, paint: PaintedView, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _seen_in(means: np.ndarray, view: Camera, paint: PaintedView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows of the seeds that a painted view shows by pixels of its own, the directions to them, and their colours."""
     height, width = paint.rules.shape
     part = cropped(view, (slice(paint.top, paint.top + height), slice(paint.left, paint.left + width)))
-    visible = np.flatnonzero(sees(part, paint.depth, means, tolerance))
+    visible = np.flatnonzero(sees(part, paint.depth, means, SAME_DEPTH))
     uv, _ = part.project(means[visible])
     cols, rows = uv.astype(int).T
     own = np.isin(paint.rules[rows, cols], OWN_RULES)
     index = visible[own]
-    return index, _towards(means[index], view), paint.image[rows[own], cols[own]] / 255.0
-
-
-def _towards(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit directions from the camera to the points."""
-    towards = means - camera.centre
-    return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    return index, directions(means[index], view), paint.image[rows[own], cols[own]] / 255.0

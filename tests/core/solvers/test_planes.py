@@ -7,7 +7,7 @@ import pytest
 
 from gimp3d.camera import Camera
 from gimp3d.solvers.planes import planar_surfaces
-from gimp3d.stages.layers import distance_to
+from gimp3d.stages.depth.layers import distance_to
 
 H, W = 120, 160
 V, U = np.mgrid[:H, :W].astype(float)

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
 
+from gimp3d.solvers import thin_plate as module
 from gimp3d.solvers.poisson import solve_poisson
-from gimp3d.solvers.thin_plate import ThinPlateSettings, thin_plate
+from gimp3d.solvers.thin_plate import thin_plate
 
 H, W = 90, 120
 V, U = np.mgrid[:H, :W].astype(float)
@@ -25,10 +26,11 @@ def test_slopes_are_continued_exactly(level, across, down):
 
 
 @pytest.mark.parametrize("unknowns", [100000, 1500, 400])
-def test_a_saddle_is_continued_on_any_grid(unknowns):
+def test_a_saddle_is_continued_on_any_grid(unknowns, monkeypatch):
     """x² − y² and xy bend without a force: they are minima of the bending energy."""
     saddle = ((U - 60) ** 2 - (V - 45) ** 2 + 2 * (U - 60) * (V - 45)) / 1000
-    found = thin_plate(saddle, RING * 1.0, HOLE, ThinPlateSettings(tension=1e6, unknowns=unknowns))
+    monkeypatch.setattr(module, "TENSION", 1e6)
+    found = thin_plate(saddle, RING * 1.0, HOLE, unknowns)
     assert np.abs(found - saddle)[HOLE].max() < 0.02 * np.ptp(saddle)
 
 
@@ -39,28 +41,30 @@ def test_a_bump_is_continued_better_than_by_a_membrane():
     assert plate < 0.4 * membrane
 
 
-def test_tension_makes_a_membrane_of_it():
+def test_tension_makes_a_membrane_of_it(monkeypatch):
     """The tighter, the nearer to Laplace's equation; only the rim's smoothing is left."""
     bump = np.exp(-((U - 64) ** 2 + (V - 42) ** 2) / 1500)
     membrane = solve_poisson(HOLE, ~HOLE, bump).values[HOLE]
-    apart = [
-        np.abs(thin_plate(bump, RING * 1.0, HOLE, ThinPlateSettings(tension=t, smoothing=0.5))[HOLE] - membrane).max()
-        for t in (3.0, 0.3, 0.1)
-    ]
+    monkeypatch.setattr(module, "SMOOTHING", 0.5)
+    apart = []
+    for tension in (3.0, 0.3, 0.1):
+        monkeypatch.setattr(module, "TENSION", tension)
+        apart.append(np.abs(thin_plate(bump, RING * 1.0, HOLE)[HOLE] - membrane).max())
     assert apart == sorted(apart, reverse=True) and apart[-1] < 0.25 * apart[0]
 
 
-def test_outliers_do_not_count():
+def test_outliers_do_not_count(monkeypatch):
     rng = np.random.default_rng(0)
     plane = 1 + 0.01 * U
     spoilt = np.where(rng.random((H, W)) < 0.05, plane + rng.uniform(-3, 3, (H, W)), plane)
     spoilt += 0.001 * rng.standard_normal((H, W))
     assert np.abs(thin_plate(spoilt, RING * 1.0, HOLE) - plane)[HOLE].mean() < 0.01
-    trusting = thin_plate(spoilt, RING * 1.0, HOLE, ThinPlateSettings(outlier=np.inf))
+    monkeypatch.setattr(module, "OUTLIER", np.inf)
+    trusting = thin_plate(spoilt, RING * 1.0, HOLE)
     assert np.abs(trusting - plane)[HOLE].mean() > 0.03
 
 
-def test_a_cluster_of_outliers_does_not_count():
+def test_a_cluster_of_outliers_does_not_count(monkeypatch):
     """Remains of the object, an island in the hole: a plate that bends to them would make a mound."""
     island = np.hypot(V - 48, U - 66) < 4
     plane = 1 + 0.01 * U
@@ -68,7 +72,8 @@ def test_a_cluster_of_outliers_does_not_count():
     hole = HOLE & ~island
     found = thin_plate(values, (RING | island) * 1.0, hole)
     assert np.abs(found / plane - 1)[hole].max() < 0.02
-    bent = thin_plate(values, (RING | island) * 1.0, hole, ThinPlateSettings(outlier=np.inf))
+    monkeypatch.setattr(module, "OUTLIER", np.inf)
+    bent = thin_plate(values, (RING | island) * 1.0, hole)
     assert np.abs(bent / plane - 1)[hole].max() > 0.2
 
 

@@ -10,8 +10,9 @@ import scipy.stats
 from gimp3d.errors import IllPosed
 from gimp3d.solvers.poisson import solve_poisson
 from gimp3d.stages.depth import DepthSettings, complete_disparity, fit_prior
-from gimp3d.stages.depth_evidence import DepthEvidence
-from gimp3d.stages.layers import background_rim
+from gimp3d.stages.depth import complete as complete_module
+from gimp3d.stages.depth.evidence import DepthEvidence
+from gimp3d.stages.depth.layers import background_rim
 
 H, W = 120, 160
 V, U = np.mgrid[:H, :W].astype(float)
@@ -242,14 +243,16 @@ def test_guidance_is_hardly_ever_worse_than_none():
     assert np.mean(worse) <= 0.03
 
 
-def test_planes_are_not_given_up_for_a_prior_that_tells_them_worse():
+def test_planes_are_not_given_up_for_a_prior_that_tells_them_worse(monkeypatch):
     """A step's prior correlates with it, however wrong it is elsewhere: 15 % of the range here."""
     hole = blob()
     for seed in range(3):
         _, scene, prior = random_case(seed, "step", 0.15)
         truth = random_case(seed, "step", 0)[0]
         guided, none = (complete_disparity(scene, ~hole, hole, p) for p in (prior, None))
-        as_measured = complete_disparity(scene, ~hole, hole, prior, DepthSettings(prior_miss=1e9))
+        with monkeypatch.context() as patch:
+            patch.setattr(complete_module, "PRIOR_MISS", 1e9)
+            as_measured = complete_disparity(scene, ~hole, hole, prior)
         off, off_none, off_measured = (relative_error(x, truth, hole).mean() for x in (guided, none, as_measured))
         assert guided.scale_factor > 0 and "prior believed by" in guided.reason
         assert off < 1.1 * off_none and off < 0.5 * off_measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gimp3d.stages.layers import background_rim, divided, separated, steps, without_front
+from gimp3d.stages.depth.layers import background_rim, divided, separated, steps, without_front
 
 H, W = 120, 160
 V, U = np.mgrid[:H, :W].astype(float)

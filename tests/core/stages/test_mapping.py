@@ -9,6 +9,7 @@ import pytest
 
 from gimp3d.camera import Camera
 from gimp3d.compute.threads import set_thread_count
+from gimp3d.geometry import SAME_DEPTH
 from gimp3d.stages.mapping import MappingSettings, mapping_field, source_visibility
 
 View = tuple[Camera, np.ndarray, np.ndarray]
@@ -61,7 +62,7 @@ def test_visibility_is_the_share_of_views_that_show_the_point() -> None:
     depth = wall(reference)
     depth[:5] = 0
     found = source_visibility(reference, depth, views)
-    expected = by_projection(reference, depth, views, MappingSettings().depth_tolerance)
+    expected = by_projection(reference, depth, views, SAME_DEPTH)
     assert 0.2 < expected.mean() < 0.8
     assert np.abs(found - expected).max() < 1e-6 or (np.abs(found - expected) > 1e-6).mean() < 0.001
 

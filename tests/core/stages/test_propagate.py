@@ -23,7 +23,6 @@ from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
-from gimp3d.stages import propagate as stage
 from gimp3d.stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -34,9 +33,10 @@ from gimp3d.stages.propagate import (
     blend_band,
     blend_rim,
     near_hole,
+    paper,
     propagate,
-    smooth_depth,
 )
+from gimp3d.stages.propagate import blend as stage
 
 HOLE = (40, 60, 40, 65)  # rows and columns of T_0
 SHIFT = 30  # columns from a hole pixel to its source
@@ -153,7 +153,7 @@ def test_the_number_of_threads_does_not_matter(reference: Reference, transfer: s
 def test_the_new_surface_is_asked_for_near_the_hole_only(reference: Reference, settings_: PropagateSettings) -> None:
     target = view(reference, 2)
     unknown = np.full_like(target.depth_new, 0.3)
-    unknown[near_hole(target.target, settings_)] = target.depth_new[near_hole(target.target, settings_)]
+    unknown[near_hole(target.target)] = target.depth_new[near_hole(target.target)]
     assert (unknown != target.depth_new).any()
     whole_, part = (paint(reference, v, settings_)[0] for v in (target, replace(target, depth_new=unknown)))
     for name in ("image", "raw", "rules", "depth"):
@@ -278,10 +278,13 @@ def test_what_the_removed_gaussians_show_is_no_evidence(reference: Reference) ->
     assert error(image, target, target.target & (rules != Rule.UNREACHED)) < 7
 
 
-def test_the_papers_transfer_samples_the_views_own_pixels(reference: Reference) -> None:
+def test_the_papers_transfer_samples_the_views_own_pixels(
+    reference: Reference, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every source is 30 columns off in the reference: that place's colour in the view is what is painted."""
     target = view(reference, 2)
-    settings_ = PropagateSettings(transfer="sample", patch=1)
+    monkeypatch.setattr(paper, "RADIUS", 0)
+    settings_ = PropagateSettings(transfer="sample")
     painted, _, rules = paint(reference, target, settings_)
     raw = painted.pasted(target.base, painted.raw)
     own = rules == Rule.OWN_PIXELS
@@ -311,11 +314,14 @@ def hide_sources(reference: Reference, target: ViewToPaint, beyond: int) -> View
     )
 
 
-def test_a_hidden_source_is_retargeted_to_a_patch_that_looks_alike(reference: Reference) -> None:
+def test_a_hidden_source_is_retargeted_to_a_patch_that_looks_alike(
+    reference: Reference, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "ALIKE", 40.0)
     target = hide_sources(reference, view(reference, 2), beyond=0)
     alone = PropagateSettings(transfer="sample", retarget=0, donors=0)
     _, _, without = paint(reference, target, alone)
-    painted, _, rules = paint(reference, target, replace(alone, retarget=32, misfit=40.0))
+    painted, _, rules = paint(reference, target, replace(alone, retarget=32))
     found = rules == Rule.RETARGETED
     assert not (without == Rule.RETARGETED).any()
     assert found.sum() > 0.3 * target.target.sum()
@@ -323,9 +329,10 @@ def test_a_hidden_source_is_retargeted_to_a_patch_that_looks_alike(reference: Re
     assert error(raw, target, found) < 40 and not (raw[found] == [200, 0, 0]).all(-1).any()
 
 
-def test_nothing_that_looks_different_is_retargeted_to(reference: Reference) -> None:
+def test_nothing_that_looks_different_is_retargeted_to(reference: Reference, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper, "ALIKE", 0.0)
     target = hide_sources(reference, view(reference, 2), beyond=0)
-    _, _, rules = paint(reference, target, PropagateSettings(transfer="sample", misfit=0.0, donors=0))
+    _, _, rules = paint(reference, target, PropagateSettings(transfer="sample", donors=0))
     assert not (rules == Rule.RETARGETED).any()
 
 
@@ -387,19 +394,6 @@ def test_a_part_is_pasted_where_it_belongs() -> None:
     assert part.rule_map(6, 4)[3:5, 1:3].tolist() == rules.tolist() and part.rule_map(6, 4).sum() == rules.sum()
 
 
-def test_smoothing_keeps_planes_and_edges() -> None:
-    rows, cols = np.mgrid[:40, :50]
-    plane = (1 / (0.2 + 0.0004 * rows + 0.0002 * cols)).astype(np.float32)
-    np.testing.assert_allclose(smooth_depth(plane, 0.005), plane, rtol=1e-5)
-    step = np.where(cols < 25, 2.0, 3.0).astype(np.float32)
-    np.testing.assert_allclose(smooth_depth(step, 0.005), step, rtol=1e-6)
-    noisy = plane * (1 + 0.001 * np.random.default_rng(0).normal(size=plane.shape)).astype(np.float32)
-    left = np.abs(smooth_depth(noisy, 0.005) / plane - 1)[3:-3, 3:-3].mean()
-    assert left < 0.4 * np.abs(noisy / plane - 1)[3:-3, 3:-3].mean()
-    nothing = np.zeros((5, 6), np.float32)
-    assert (smooth_depth(nothing, 0.005) == 0).all()
-
-
 def seam(rows: int = 30, cols: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A far wall on the left, a near thing on the right: base, depth, and a hole over both."""
     base = np.full((rows, cols, 3), 100, np.uint8)
@@ -415,16 +409,16 @@ def test_the_papers_blend_takes_no_boundary_across_a_depth_seam() -> None:
     base, depth, painted = seam()
     painted[:, 20:] = False
     raw = np.full((*painted.shape, 3), 60.0, np.float32)
-    blended = blend_rim(base, raw, painted, np.zeros_like(painted), depth, PropagateSettings())
+    blended = blend_rim(base, raw, painted, np.zeros_like(painted), depth)
     assert (blended[painted] == 100).all() and (blended[~painted] == base[~painted]).all()
 
 
 def test_the_blend_corrects_each_side_of_a_depth_seam_by_its_own_photo() -> None:
     base, depth, painted = seam()
     raw = np.where(depth[..., None] > 3, 60.0, 240.0) * np.ones(3, np.float32)
-    blended = blend_band(base, raw, painted, ~painted, 6.0, depth, np.zeros(3), PropagateSettings())
+    blended = blend_band(base, raw, painted, ~painted, 6.0, depth, np.zeros(3))
     assert (blended[painted] == base[painted]).all() and (blended[~painted] == base[~painted]).all()
-    flat = blend_band(base, raw, painted, ~painted, 6.0, np.ones_like(depth), np.zeros(3), PropagateSettings())
+    flat = blend_band(base, raw, painted, ~painted, 6.0, np.ones_like(depth), np.zeros(3))
     assert np.abs(flat[painted].astype(int) - base[painted]).max() > 5
 
 
@@ -432,7 +426,7 @@ def test_a_part_without_photo_is_corrected_by_the_offset_alone() -> None:
     base, depth, painted = seam()
     raw = np.full((*painted.shape, 3), 60.0, np.float32)
     nothing = np.zeros_like(painted)
-    blended = blend_band(base, raw, painted, nothing, 6.0, depth, np.array([5.0, -3.0, 0.0]), PropagateSettings())
+    blended = blend_band(base, raw, painted, nothing, 6.0, depth, np.array([5.0, -3.0, 0.0]))
     assert (blended[painted] == [65, 57, 60]).all()
 
 
@@ -462,7 +456,7 @@ def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
     painted[h // 4 : 3 * h // 4, w // 4 : 3 * w // 4] = rng.random((3 * h // 4 - h // 4, 3 * w // 4 - w // 4)) < 0.95
     band = ~painted & (rng.random((h, w)) < 0.8)
     with mock.patch.object(stage, "solve_poisson", wraps=stage.solve_poisson) as solver:
-        blended = blend_band(base, raw, painted, band, width, np.ones((h, w)), np.zeros(3), PropagateSettings())
+        blended = blend_band(base, raw, painted, band, width, np.ones((h, w)), np.zeros(3))
     (domain, *_), system = solver.call_args
     assert (domain == (stage.cv2.distanceTransform((~painted).astype(np.uint8), 2, 5) <= stage.FAR * width)).all()
     correction = np.zeros(base.shape)
@@ -479,7 +473,7 @@ def test_what_few_pixels_of_photo_say_fades_with_the_distance() -> None:
     painted[:, :2] = False
     band = np.zeros_like(painted)
     band[19:21, 1] = True  # a hundredth of the hole's outline
-    blended = blend_band(base, raw, painted, band, 4.0, np.ones((40, 120)), np.zeros(3), PropagateSettings())
+    blended = blend_band(base, raw, painted, band, 4.0, np.ones((40, 120)), np.zeros(3))
     assert blended[20, 2, 0] > 70 and blended[20, 115, 0] < 66
 
 
@@ -491,7 +485,7 @@ def test_photo_that_shows_something_else_does_not_colour_the_fill() -> None:
     other = np.zeros_like(painted)
     other[18:42, 42:50] = True  # a blue thing that stands elsewhere in the reference's picture
     raw[other] = [20, 30, 180]
-    blended = blend_band(base, raw, painted, ~painted, 3.0, np.ones((60, 60)), np.zeros(3), PropagateSettings())
+    blended = blend_band(base, raw, painted, ~painted, 3.0, np.ones((60, 60)), np.zeros(3))
     assert np.abs(blended[painted].mean(0) - 120).max() < 2
 
 
@@ -503,5 +497,5 @@ def test_where_hardly_any_photo_touches_the_hole_what_lies_farther_away_tells_it
     band = np.zeros_like(painted)
     band[:15], band[51, 30:34] = True, True
     base[51, 30:34] = 180  # a few pixels beside it show the object's edge
-    blended = blend_band(base, raw, painted, band, 4.0, np.ones((80, 80)), np.zeros(3), PropagateSettings())
+    blended = blend_band(base, raw, painted, band, 4.0, np.ones((80, 80)), np.zeros(3))
     assert np.abs(blended[painted].mean(0) - 150).max() < 3

@@ -82,11 +82,12 @@ def test_the_result_does_not_depend_on_threads_or_the_run(
 
 
 def test_held_out_views_keep_the_start_where_every_step_harms(
-    task: tuple[Gaussians, Gaussians, list[Observation]],
+    task: tuple[Gaussians, Gaussians, list[Observation]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known, seeds, observations = task
-    wild = replace(QUICK, steps=30, check=5, rate_means=50.0, rate_colour=5.0)
-    found = refine_gaussians(known, seeds, observations, wild)
+    monkeypatch.setattr(refine, "RATES", {**refine.RATES, "means": 50.0})
+    monkeypatch.setattr(refine, "COLOUR", 5.0)
+    found = refine_gaussians(known, seeds, observations, replace(QUICK, steps=30, check=5))
     assert found.steps == 0 and found.after == found.before
     for name in FIELDS:
         assert np.array_equal(getattr(found.gaussians, name), getattr(seeds, name))
@@ -106,10 +107,10 @@ def test_nothing_to_do_returns_the_input() -> None:
 def test_steps_are_those_of_torchs_own_adam() -> None:
     torch = pytest.importorskip("torch")
     seeds = replace(floor(with_hole=True).take(np.arange(20)), sh=np.zeros((20, 4, 3), np.float32))
-    state, rng = refine._State(seeds, QUICK), np.random.default_rng(0)
+    state, rng = refine._State(seeds), np.random.default_rng(0)
     arrays = (*(getattr(seeds, name).copy() for name in FIELDS[:4]), seeds.sh[:, :1].copy(), seeds.sh[:, 1:].copy())
     theirs = [torch.from_numpy(a).requires_grad_() for a in arrays]
-    rates = [state.rates[name] for name in FIELDS[:4]] + [QUICK.rate_colour, QUICK.rate_view_dependence]
+    rates = [state.rates[name] for name in FIELDS[:4]] + [refine.COLOUR, refine.VIEW_DEPENDENCE]
     optimiser = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(theirs, rates)], eps=1e-15)
     for _ in range(5):
         slopes = {name: rng.normal(size=getattr(seeds, name).shape).astype(np.float32) for name in FIELDS}
@@ -126,7 +127,7 @@ def test_steps_are_those_of_torchs_own_adam() -> None:
 
 def test_the_losss_gradient_by_differences(task: tuple[Gaussians, Gaussians, list[Observation]]) -> None:
     known, seeds, observations = task
-    view = refine._View(known, observations[3], QUICK)
+    view = refine._View(known, observations[3])
     drawn, rng = view.region.render(seeds), np.random.default_rng(1)
     pictures = ["rgb", *(["normals", "expected_depth", "distortion"] if known.is_surfels else [])]
     exact = replace(drawn, **{name: getattr(drawn, name).astype(np.float64) for name in pictures})
@@ -148,7 +149,7 @@ def test_structure_is_that_of_the_metric() -> None:
     camera = replace(cameras(9)[0], width=50, height=40)
     everywhere = np.ones((40, 50), bool)
     seen = Observation(camera, b, everywhere, everywhere.astype(np.float32))
-    view = refine._View(floor(with_hole=True), seen, QUICK)
+    view = refine._View(floor(with_hole=True), seen)
     found = view._ssim(a.astype(np.float32) / 255, view.share[..., None] / 3)[0]
     inner = np.s_[6:-6, 6:-6]  # off the border, which the metric mirrors
     np.testing.assert_allclose(found.mean(-1)[inner], ssim_map(a, b)[inner], atol=1e-4)

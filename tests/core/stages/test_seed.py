@@ -337,11 +337,9 @@ def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
     below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
     seen_from = [v.camera for v in views]
-    new = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
+    new = settle_gaussians(truth(), below, view.camera, seen_from, painted)
     assert len(new) < 0.1 * len(below)  # the floor hides them
-    everything = settle_gaussians(
-        truth(), below, view.camera, seen_from, painted, SeedSettings(needed=0, corrections=0, sink=0)
-    )
+    everything = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
     assert np.array_equal(everything.means, below.means)
 
 

@@ -1,37 +1,29 @@
-"""Which surfaces round a hole go on behind the object, and where each of them lies (METHOD section 3: no smear)."""
+"""Which surfaces round a hole go on behind the object, and where each of them lies: nothing smears across a step."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import cv2
 import numpy as np
 import scipy.ndimage
 
-from ..schema import Positive, Share
-from ..solvers.poisson import solve_poisson
+from ...solvers.poisson import solve_poisson
 
 AROUND = np.ones((3, 3), bool)  # a pixel and its 8 neighbours
-
-
-@dataclass(frozen=True)
-class LayerSettings:
-    """Lengths in pixels; steps of disparity are relative."""
-
-    step: Positive = 0.06  # on the rim, that parts two layers
-    band: int = 4  # width of the ring on which layers are told apart
-    least: Share = 0.1  # share of the rim that a layer must hold to reach into the hole
-    occluder_share: Share = 0.25  # of the rim, at most, is taken for occluders; more is what the object stood on
-    reach: int = 24  # width of the ring in which a surface in front of the object is followed
-    front_share: Share = 0.05  # of a part of that ring that must be seen to be in front
-    straight: Share = 0.97  # share of two layers' ring pixels that a line must part for it to be their border
+STEP = 0.06  # relative difference of disparity that parts two layers: six times what made scenes scatter by
+BAND = 4  # px, width of the ring on which occluders are told
+REACH = 24  # px, width of the ring in which a surface in front of the object is followed
+LEAST_LAYER = 0.1  # share of the rim that a layer must hold to reach into the hole
+OCCLUDERS = 0.25  # share of the rim, at most, that is taken for occluders; more is what the object stood on
+FRONT = 0.05  # share of a part of the ring that must be seen to be in front for all of it to be
+STRAIGHT = 0.97  # share of two layers' pixels that a line must part for it to be their border
 
 
 def steps(
     disparity: np.ndarray,  # [H, W]
     known: np.ndarray,  # [H, W] bool
-    threshold: float,  # relative
+    step: float = STEP,  # relative
 ) -> np.ndarray:
     """[H, W] bool: known pixels within 2 px of a step.
 
@@ -45,7 +37,7 @@ def steps(
         for dy, dx in ((0, 2), (2, 0), (2, 2), (2, -2)):
             after = padded[2 + dy : 2 + dy + h, 2 + dx : 2 + dx + w]
             before = padded[2 - dy : 2 - dy + h, 2 - dx : 2 - dx + w]
-            found |= np.abs(before + after - 2 * disparity) > threshold * np.maximum(before, after)
+            found |= np.abs(before + after - 2 * disparity) > step * np.maximum(before, after)
     return found & known
 
 
@@ -53,7 +45,7 @@ def background_rim(
     disparity: np.ndarray,  # [H, W]
     known: np.ndarray,  # [H, W] bool
     hole: np.ndarray,  # [H, W] bool
-    settings: LayerSettings = LayerSettings(),
+    step: float = STEP,
 ) -> np.ndarray:
     """[H, W] bool: the known pixels that may bound the hole, that is, not those of occluders in front of it.
 
@@ -62,8 +54,8 @@ def background_rim(
     go on. Surfaces that meet, as a floor and a wall, have no step between them, however steep.
     """
     distance = distance_to(hole)
-    band = known & (distance <= settings.band)
-    edges = band & steps(disparity, known, settings.step)
+    band = known & (distance <= BAND)
+    edges = band & steps(disparity, known, step)
     layers, count = scipy.ndimage.label(band & ~edges, AROUND)
     if count < 2:
         return known
@@ -72,10 +64,10 @@ def background_rim(
     heights = scipy.ndimage.median(disparity, layers, numbers)
     far_first = np.argsort(heights)
     reached = np.cumsum(sizes[far_first])
-    background = heights[far_first][np.searchsorted(reached, (1 - settings.occluder_share) * reached[-1])]
-    nearer = heights > (1 + settings.step) * background
+    background = heights[far_first][np.searchsorted(reached, (1 - OCCLUDERS) * reached[-1])]
+    nearer = heights > (1 + step) * background
     behind = np.isin(layers, numbers[~nearer])
-    occluder = [k for k in numbers[nearer] if _stepped(disparity, layers == k, behind, settings)]
+    occluder = [k for k in numbers[nearer] if _stepped(disparity, layers == k, behind, step)]
     front = np.isin(layers, occluder)
     # Of the step's own pixels, those on its upper half belong to the occluder.
     top = scipy.ndimage.maximum_filter(np.where(known, disparity, -np.inf), 5)
@@ -91,18 +83,20 @@ def without_front(
     known: np.ndarray,  # [H, W] bool
     hole: np.ndarray,  # [H, W] bool
     front: np.ndarray,  # [H, W] bool, pixels seen to lie in front of the object, at its outline; or wrong
-    settings: LayerSettings = LayerSettings(),
+    share: float = FRONT,  # of a part of the ring that must be front for all of it to go
+    step: float = STEP,
 ) -> np.ndarray:
-    """[H, W] bool: the known pixels without the surfaces that hide the object itself: they bound nothing behind it.
+    """[H, W] bool: the known pixels without surfaces that must not be continued into the hole.
 
-    Likewise without surfaces that are not there. A part of the ring, cut at steps, goes if enough of it is front.
+    Those are surfaces that hide the object itself, as the hole lies behind them, and surfaces that are not there. The
+    ring round the hole is cut at steps into parts; a part goes if the given share of it is `front`.
     """
     if not (front & known).any():
         return known
-    ring = known & (distance_to(hole) <= settings.reach)
-    labels, _ = scipy.ndimage.label(ring & ~steps(disparity, known, settings.step), AROUND)
+    ring = known & (distance_to(hole) <= REACH)
+    labels, _ = scipy.ndimage.label(ring & ~steps(disparity, known, step), AROUND)
     size, marked = np.bincount(labels.ravel()), np.bincount(labels[front], minlength=labels.max() + 1)
-    gone = marked >= settings.front_share * size
+    gone = marked >= share * size
     gone[0] = False
     edge = ring & (labels == 0) & (front | scipy.ndimage.binary_dilation(gone[labels], AROUND, iterations=2))
     return known & ~gone[labels] & ~edge
@@ -112,25 +106,25 @@ def separated(
     disparity: np.ndarray,  # [H, W]
     measured: np.ndarray,  # [H, W] bool, the pixels to be parted
     rim: np.ndarray,  # [H, W] bool, those of them that touch the hole
-    settings: LayerSettings = LayerSettings(),
+    step: float = STEP,
 ) -> list[np.ndarray]:
     """The layers [H, W] bool into which steps part the measured pixels; one if nothing parts them for certain.
 
     Only parts that hold enough of the rim count, and only those between which the disparity really steps.
     """
-    labels, _ = scipy.ndimage.label(measured & ~steps(disparity, measured, settings.step), AROUND)
+    labels, _ = scipy.ndimage.label(measured & ~steps(disparity, measured, step), AROUND)
     held = np.bincount(labels[rim], minlength=labels.max() + 1)
     held[0] = 0
-    parts = [labels == k for k in np.flatnonzero(held >= max(1.0, settings.least * rim.sum()))]
+    parts = [labels == k for k in np.flatnonzero(held >= max(1.0, LEAST_LAYER * rim.sum()))]
     group = list(range(len(parts)))
     for i, j in combinations(range(len(parts)), 2):
-        if not _stepped(disparity, parts[i], parts[j], settings):
+        if not _stepped(disparity, parts[i], parts[j], step):
             group = [group[i] if g == group[j] else g for g in group]
     layers = [np.any([p for p, g in zip(parts, group) if g == k], axis=0) for k in sorted(set(group))]
     return layers if len(layers) > 1 else [measured]
 
 
-def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, settings: LayerSettings) -> bool:
+def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, step: float) -> bool:
     """Whether two parts differ clearly where they come near each other; parts that do not come near are not parted.
 
     Each part's plane there is continued to the other part and half way to it: a slope across a gap is no step, nor are
@@ -146,14 +140,13 @@ def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, settings: Laye
     places = [points[0].mean(0), points[1].mean(0), (points[0].mean(0) + points[1].mean(0)) / 2]
     apart = min(abs(float(place @ (planes[0] - planes[1]))) for place in places)
     level = abs(float(np.median(values[0])) - float(np.median(values[1])))
-    return min(apart, level) > settings.step * max(float(np.median(v)) for v in values)
+    return min(apart, level) > step * max(float(np.median(v)) for v in values)
 
 
 def divided(
     hole: np.ndarray,  # [H, W] bool
     seeds: np.ndarray,  # [H, W] int, the layer of rim pixels and of what is measured in the hole; −1 elsewhere
     rings: list[np.ndarray],  # per layer [H, W] bool, all its measured pixels
-    settings: LayerSettings = LayerSettings(),
 ) -> np.ndarray:
     """[H, W] int: the layer of each of the hole's pixels.
 
@@ -164,15 +157,15 @@ def divided(
     if len(present) < 2:
         return np.full(hole.shape, present[0] if len(present) else 0)
     if len(present) == 2:
-        side = _straight_border(rings[present[0]], rings[present[1]], settings.straight)
+        side = _straight_border(rings[present[0]], rings[present[1]])
         inside = hole & (seeds >= 0)
-        if side is not None and (side == (seeds == present[0]))[inside].sum() >= settings.straight * inside.sum():
+        if side is not None and (side == (seeds == present[0]))[inside].sum() >= STRAIGHT * inside.sum():
             return np.where(side, present[0], present[1])
     votes = solve_poisson(hole & (seeds < 0), seeds >= 0, (seeds[..., None] == present).astype(np.float64)).values
     return present[np.nan_to_num(votes).argmax(-1)]
 
 
-def _straight_border(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray | None:
+def _straight_border(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     """[H, W] bool: the side of the first of two sets of pixels, if a line parts them (logistic regression)."""
     v, u = np.mgrid[: a.shape[0], : a.shape[1]]
     sets = [np.stack([u[s], v[s], np.ones(s.sum())], -1) for s in (a, b)]
@@ -188,7 +181,7 @@ def _straight_border(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray |
         gradient = points.T @ (weight * sign * odds) - 1e-3 * line
         curvature = (points.T * (weight * odds * (1 - odds))) @ points + 1e-3 * np.eye(3)
         line = line + np.linalg.solve(curvature, gradient)
-    if ((sign * (points @ line) > 0) * weight).sum() < 2 * share:
+    if ((sign * (points @ line) > 0) * weight).sum() < 2 * STRAIGHT:
         return None
     return line[0] * (u - centre[0]) / size + line[1] * (v - centre[1]) / size + line[2] > 0
 

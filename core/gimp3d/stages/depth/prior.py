@@ -1,4 +1,4 @@
-"""How a relative depth prior turns into the scene's disparity (METHOD section 3: scale of a depth prior)."""
+"""How a relative depth prior turns into the scene's disparity (docs/method.md)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..solvers.poisson import solve_poisson
-from ..solvers.robust import CUT, robust_fit
-from .depth_fill import DepthSettings
+from ...solvers.poisson import solve_poisson
+from ...solvers.robust import CUT, robust_fit
+from .fill import LEAST_PIXELS, DepthSettings
 from .layers import distance_to
 
+RING = 12  # px, width of the ring round the hole on which s_f is measured
 SHOWN = 1500  # ring pixels kept for the fit's picture
-RELIEF = 6  # px; differences over this distance tell relief from a prior's smooth errors best (research, K2)
+RELIEF = 6  # px; differences over this distance tell relief from a prior's smooth errors best (research)
 FULL = 0.7  # correlation of relief from which it is believed whole; below, its square shares it
 DOUBT = 2.0  # times the variance that the prior's error takes of its relief in the hole
 SAME = 1e-3  # relative difference of disparities that is never held against a pixel
@@ -52,7 +53,7 @@ def fit_prior(
     settings: DepthSettings = DepthSettings(),
     on_ring: bool = True,  # else on everything known
 ) -> PriorFit:
-    """Measure s_f by a robust affine fit of the scene's disparity to the prior on the ring (METHOD section 3).
+    """Measure s_f by a robust affine fit of the scene's disparity to the prior on the ring (docs/method.md).
 
     The fit tells the prior's units. Whether to follow it into the hole is another question: what a plane tells as well
     needs no prior. It is believed as far as its relief on the ring is the scene's, or as far as its relief in the hole
@@ -62,9 +63,9 @@ def fit_prior(
     """
     ring = known & (disparity > 0) & np.isfinite(prior)
     if on_ring:
-        ring &= distance_to(hole) <= settings.ring
+        ring &= distance_to(hole) <= RING
     m, d = prior[ring].astype(np.float64), disparity[ring].astype(np.float64)
-    if len(m) < settings.minimum_ring:
+    if len(m) < LEAST_PIXELS:
         return PriorFit(0.0, 0.0, 0.3, "prior not used, too little is known round the hole to scale it")
     shown = np.stack([m, d], -1)[:: max(1, len(m) // SHOWN)].astype(np.float32)
 

@@ -1,0 +1,148 @@
+"""From the reference into every view, by each view's own pixels (paper Algorithm 1; docs/method.md).
+
+`warp` finds where the surface that a view shows lies in the reference, `transfer` learns what differs between the two
+pictures of one surface point, `blend` fits the result to the photo round the hole. `paper` is how the paper does it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+
+import cv2
+import numpy as np
+
+from ...compute.threads import at_once, parallel_map
+from ...errors import BadInput
+from ...geometry import EVIDENCE_DEPTH, bounds, cropped
+from ...progress import Progress, silent
+from ...solvers.colours import NO_CHANGE
+from .blend import blend_band, to_bytes
+from .paper import Lent, Mapped, blend_rim, lent_colours, sampled
+from .transfer import flat, learned_change
+from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
+from .warp import picture_of, warp_reference
+
+__all__ = [
+    "Loader",
+    "PaintedView",
+    "PropagateSettings",
+    "Propagation",
+    "Reference",
+    "Rule",
+    "ViewToPaint",
+    "blend_band",
+    "blend_rim",
+    "near_hole",
+    "propagate",
+]
+
+TRANSFERS = ("learned", "sample", "none")
+BLENDS = ("band", "rim")
+SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area
+LEAST_REACH = 16  # px of that
+BAND = 1 / 8  # of that: the strip round the hole that the blend is fitted to most
+
+
+def near_hole(target: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of what is looked at when the target [H, W] bool is painted; empty if that is."""
+    return bounds(target, _reach(target))
+
+
+def _reach(target: np.ndarray) -> int:
+    return max(LEAST_REACH, math.ceil(SURROUNDINGS * math.sqrt(target.sum())))
+
+
+def propagate(
+    reference: Reference,
+    views: Sequence[Loader],
+    settings: PropagateSettings = PropagateSettings(),
+    progress: Progress = silent,
+) -> Propagation:
+    """Paint the hole of every view. Painted views are never sources for others: order is irrelevant.
+
+    As many views are in memory as threads work on them; what is kept of each is the part round its hole.
+
+    Raises
+    ------
+    BadInput
+        If the transfer or the blend is unknown.
+    """
+    for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
+        if value not in known:
+            raise BadInput(f"propagate: unknown {name} {value!r}; use {', '.join(known)}")
+    mapped = Mapped.of(reference, settings.transfer != "none")
+    lent = lent_colours(mapped, views, settings) if settings.transfer == "sample" else ()
+    done = 0
+
+    def paint(load: Loader) -> PaintedView:
+        nonlocal done
+        view = load()
+        painted = _painted(mapped, view, lent, settings)
+        done += 1
+        progress("propagate", done, len(views), view.camera.id)
+        return painted
+
+    painted = tuple(parallel_map(paint, views, at_once(reference.target.size)))
+    counts = sum((np.bincount(p.rules.ravel(), minlength=len(Rule)) for p in painted), np.zeros(len(Rule), int))
+    total = max(1, counts[1:].sum())
+    shares = ", ".join(f"{counts[r] / total:.0%} {r.name.lower().replace('_', ' ')}" for r in list(Rule)[1:-1])
+    return Propagation(painted, float(1 - counts[Rule.UNREACHED] / total), shares)
+
+
+def _painted(mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], settings: PropagateSettings) -> PaintedView:
+    """One view: what of it is photo of the new surface, the rest warped, changed and blended."""
+    if not view.target.any():
+        nothing = np.zeros((0, 0, 3), np.uint8)
+        return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
+    reference, reach = mapped.reference, _reach(view.target)
+    near, top, left = _cropped(view, reach)
+    same = _same_surface(near)
+    evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
+    hole = near.target & ~evidence
+    base = np.where(evidence[..., None], near.image, near.base)
+    distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    photo = ~near.silhouette & same & ~hole & (distance <= reach)
+    depth = np.ascontiguousarray(near.depth_new, np.float32)
+    warp = warp_reference(mapped.picture, near.camera, depth, hole | photo)
+    painted, photo = hole & warp.reached, photo & warp.reached
+    photo[photo] = warp.lookup(reference.source | reference.target, photo)
+    sources = mapped.sources_in(picture_of(view), settings.retarget)
+    rules = mapped.rules(sources, warp, hole)
+    raw, change = warp.colours, NO_CHANGE
+    if settings.transfer == "sample":
+        raw, rules = sampled(mapped, view, sources, lent, warp, rules)
+    elif settings.transfer == "learned":
+        alike = photo & flat(depth)
+        alike[alike] = warp.lookup(reference.source, alike)
+        change = learned_change(warp.colours, base - warp.colours, alike, hole, reach)
+        raw = warp.colours + change.of(warp.colours).astype(np.float32)
+    if settings.blend == "rim":
+        blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
+    else:
+        blended = blend_band(base, raw, painted, photo, BAND * reach, depth, change.offset)
+    rules[evidence] = Rule.EVIDENCE
+    rows, cols = bounds(near.target)
+    return PaintedView(
+        view.camera.id,
+        top + rows.start,
+        left + cols.start,
+        blended[rows, cols].copy(),
+        to_bytes(np.where(painted[..., None], raw, base)[rows, cols]),
+        rules[rows, cols].copy(),
+        near.depth_new[rows, cols].astype(np.float32),
+    )
+
+
+def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
+    """The part of the view round its target, which is not empty, and where it begins."""
+    part = bounds(view.target, margin)
+    arrays = (getattr(view, f.name)[part] for f in fields(view) if f.name != "camera")
+    return ViewToPaint(cropped(view.camera, part), *arrays), part[0].start, part[1].start
+
+
+def _same_surface(view: ViewToPaint) -> np.ndarray:
+    """[H, W] bool: the photo's surface is the new one."""
+    near = np.abs(view.depth_before - view.depth_new) < EVIDENCE_DEPTH * view.depth_new
+    return (view.depth_before > 0) & (view.depth_new > 0) & near

@@ -1,0 +1,286 @@
+"""The paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
+
+Where the view does not show that source, another one near it that looks alike is taken (retargeting), else another
+view's pixel. Which sources a view shows, `Mapped.sources_in`, tells the default transfer which pixels are the view's
+own as well; the sampling and the blend to the rim are the paper's alone (`transfer="sample"`, `blend="rim"`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ...camera import Camera
+from ...compute.jit import inline_kernel, kernel
+from ...compute.threads import parallel_map, run_ranges
+from ...geometry import SAME_DEPTH, colours_at
+from ...solvers.colours import exposure_gain
+from ...solvers.poisson import solve_poisson
+from .blend import SEAM, SQUARE, to_bytes
+from .types import Loader, PropagateSettings, Reference, Rule, ViewToPaint
+from .warp import Picture, Warp, picture_of, shown_at
+
+RADIUS = 2  # px of the overlapping patches that are compared and blended (paper 4.1: 5 × 5)
+ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source is alike
+OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where a view shows the patches that explain the mapped pixels."""
+
+    rows: np.ndarray  # [M] int32 in the reference: the field's, or found near it
+    cols: np.ndarray
+    rules: np.ndarray  # [M] uint8: OWN, RETARGETED, or 0 where the view shows none
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The reference and the list of its mapped pixels."""
+
+    reference: Reference
+    picture: Picture
+    rows: np.ndarray  # [M] int32, mapped pixels of T_0
+    cols: np.ndarray
+    source_rows: np.ndarray  # [M] int32, f
+    source_cols: np.ndarray
+    index: np.ndarray  # [H, W] int32, each pixel's place in the list; -1 = none
+
+    @classmethod
+    def of(cls, reference: Reference, mapped: bool) -> Mapped:
+        """The reference's field, or none of it."""
+        there = reference.target & (reference.rows >= 0) & mapped
+        rows, cols = (x.astype(np.int32) for x in np.nonzero(there))
+        index = np.full(there.shape, -1, np.int32)
+        index[rows, cols] = np.arange(len(rows))
+        to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in (reference.rows, reference.cols))
+        return cls(reference, picture_of(reference), rows, cols, to_rows, to_cols, index)
+
+    def sources_in(self, view: Picture, reach: int) -> Sources:
+        """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not.
+
+        Patches are compared in the reference, where one camera sees both; the view only says which of them it shows.
+        """
+        rows, cols = self.source_rows.copy(), self.source_cols.copy()
+        rules = np.zeros(len(rows), np.uint8)
+        worst = 3 * ALIKE**2
+        places, found = (self.rows, self.cols), (rows, cols, rules)
+        run_ranges(_find_range, len(rows), *places, self.picture, view, SAME_DEPTH, RADIUS, reach, worst, *found)
+        return Sources(rows, cols, rules)
+
+    def rules(self, sources: Sources, warp: Warp, hole: np.ndarray) -> np.ndarray:
+        """[h, w] uint8: the rule of each pixel of the hole by the source of the reference pixel that it shows."""
+        rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
+        reached = hole & warp.reached
+        listed = warp.lookup(self.index, reached)
+        found = np.append(sources.rules, 0)[listed]  # -1, which is not in the list, is the last
+        rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
+        return rules
+
+
+@dataclass(frozen=True)
+class Lent:
+    """What another view shows of the mapped sources."""
+
+    camera: Camera
+    colours: np.ndarray  # [M, 3] float32
+    seen: np.ndarray  # [M] bool
+    gain: np.ndarray  # [3] its exposure over the reference's
+
+
+def lent_colours(mapped: Mapped, views: Sequence[Loader], settings: PropagateSettings) -> tuple[Lent, ...]:
+    """A few views' pixels at the mapped sources, for views that do not show them."""
+    count = min(settings.donors, len(views))
+    chosen = [views[k * len(views) // count] for k in range(count)]
+    return tuple(parallel_map(lambda load: _lend(mapped, load()), chosen))
+
+
+def sampled(
+    mapped: Mapped,
+    view: ViewToPaint,
+    sources: Sources,
+    lent: Sequence[Lent],
+    warp: Warp,
+    rules: np.ndarray,  # [h, w] uint8, see Mapped.rules
+) -> tuple[np.ndarray, np.ndarray]:
+    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole."""
+    raw, rules = warp.colours.copy(), rules.copy()
+    rows, cols = np.nonzero(warp.reached & (rules > 0))
+    places = rows, cols, warp.u, warp.v
+    taken = mapped.index, sources.rows, sources.cols, sources.rules, *_borrowed(mapped, view, sources, lent)
+    pictures = mapped.picture, picture_of(view)
+    run_ranges(_sample_range, len(rows), *places, *taken, *pictures, SAME_DEPTH, RADIUS, raw, rules)
+    return raw, rules
+
+
+def _borrowed(
+    mapped: Mapped, view: ViewToPaint, sources: Sources, lent: Sequence[Lent]
+) -> tuple[np.ndarray, np.ndarray]:
+    """[M, 3] colours of the sources by the nearest view that shows them, at this view's exposure; [M] bool: there."""
+    colours, has = np.zeros((len(sources.rows), 3), np.float32), np.zeros(len(sources.rows), bool)
+    others = sorted(
+        (x for x in lent if x.camera.id != view.camera.id),
+        key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id),
+    )
+    gain = _lend(mapped, view).gain if others else np.ones(3)
+    for other in others:
+        new = other.seen & (sources.rules == 0) & ~has
+        colours[new] = other.colours[new] * (gain / other.gain)
+        has |= new
+    return colours, has
+
+
+def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
+    seen = mapped.sources_in(picture_of(view), reach=0).rules > 0
+    reference, camera = mapped.reference, view.camera
+    rows, cols = mapped.source_rows[seen], mapped.source_cols[seen]
+    points = reference.camera.unproject(
+        np.stack([cols + 0.5, rows + 0.5], -1), mapped.picture.depth[rows, cols].astype(np.float64)
+    )
+    colours = np.zeros((len(seen), 3), np.float32)
+    colours[seen] = colours_at(view.image, camera.project(points)[0])
+    return Lent(camera, colours, seen, exposure_gain(reference.image[rows, cols], colours[seen]))
+
+
+def blend_rim(
+    base: np.ndarray,  # [H, W, 3] uint8, the view round the hole
+    raw: np.ndarray,  # [H, W, 3] float32, the fill
+    painted: np.ndarray,  # [H, W] bool, where the fill is
+    no_photo: np.ndarray,  # [H, W] bool, what bounds no fill: the rest of the hole, renderings of the emptied scene
+    depth: np.ndarray,  # [H, W] z of the new scene
+) -> np.ndarray:
+    """The paper's blend: gradients of the fill, its rim as in the view, [H, W, 3] uint8.
+
+    The rim counts only where no depth seam parts it from the fill. Parts without a rim keep their own colours.
+    """
+    if not painted.any():
+        return base.copy()
+    rim = (cv2.dilate(painted.astype(np.uint8), SQUARE) > 0) & ~painted & ~no_photo & (depth > 0)
+    nearest_fill = cv2.dilate(np.where(painted & (depth > 0), depth, 0).astype(np.float32), SQUARE)
+    rim &= np.abs(nearest_fill - depth) < SEAM * depth
+    solution = solve_poisson(painted, rim, base, np.where(painted[..., None], raw, np.nan).astype(np.float32))
+    result = base.copy()
+    anchored = painted & ~solution.unanchored
+    result[anchored] = to_bytes(solution.values[anchored])
+    free = painted & solution.unanchored
+    result[free] = to_bytes(raw[free])
+    return result
+
+
+@inline_kernel
+def _bilinear(image, u, v, channel):
+    h, w = image.shape[0], image.shape[1]
+    x, y = min(max(u - 0.5, 0.0), w - 1.0), min(max(v - 0.5, 0.0), h - 1.0)
+    x0, y0 = int(x), int(y)
+    x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
+    s, t = x - x0, y - y0
+    top = image[y0, x0, channel] * (1 - s) + image[y0, x1, channel] * s
+    bottom = image[y1, x0, channel] * (1 - s) + image[y1, x1, channel] * s
+    return top * (1 - t) + bottom * t
+
+
+@inline_kernel
+def _patch_misfit(reference, i, j, a, b, radius, worst):
+    """Mean squared difference (over pixels, summed over channels) of the patches at (i, j) and (a, b)."""
+    h, w = reference.usable.shape
+    total, count = 0.0, 0
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            p, q, r, s = i + dy, j + dx, a + dy, b + dx
+            if p < 0 or q < 0 or r < 0 or s < 0 or p >= h or q >= w or r >= h or s >= w:
+                continue
+            if not reference.usable[r, s]:
+                continue
+            for channel in range(3):
+                difference = float(reference.image[p, q, channel]) - float(reference.image[r, s, channel])
+                total += difference * difference
+            count += 1
+    return total / count if 2 * count > (2 * radius + 1) ** 2 else worst
+
+
+@kernel
+def _find_range(
+    lo, hi, rows, cols, reference, view, tolerance, radius, reach, worst, source_rows, source_cols, rules
+):  # fmt: skip
+    """Mapped pixels lo … hi−1 of the lists rows and cols: which source the view shows, and by which rule.
+
+    The sources [M] come in as the field has them and leave as they are used; `worst` is the misfit of patches of a
+    radius from which they are not alike, `reach` how far is searched in px.
+    """
+    for k in range(lo, hi):
+        i, j = rows[k], cols[k]
+        a, b = source_rows[k], source_cols[k]
+        _, _, good = shown_at(b + 0.5, a + 0.5, reference, view, tolerance)
+        if good:
+            rules[k] = OWN
+            continue
+        best, found_a, found_b = worst, -1, -1
+        step, outwards = 2, True
+        while 1 <= step <= reach:  # eight directions, ever farther out, then ever finer round the best
+            for direction in range(9):
+                p, q = a + step * (direction // 3 - 1), b + step * (direction % 3 - 1)
+                _, _, good = shown_at(q + 0.5, p + 0.5, reference, view, tolerance)
+                if good:
+                    misfit = _patch_misfit(reference, i, j, p, q, radius, worst)
+                    if misfit < best:
+                        best, found_a, found_b = misfit, p, q
+            if outwards and 2 * step > reach:
+                outwards, step = False, reach // 2
+            step = step * 2 if outwards else step // 2
+            if not outwards:
+                if found_a < 0:
+                    break
+                a, b = found_a, found_b
+        if found_a >= 0:
+            source_rows[k], source_cols[k], rules[k] = found_a, found_b, RETARGETED
+
+
+@kernel
+def _sample_range(
+    lo, hi, rows, cols, u, v, index, source_rows, source_cols, source_rules, borrowed, has, reference, view, tolerance,
+    radius, raw, rules
+):  # fmt: skip
+    """Pixels lo … hi−1 of the lists rows and cols, which lie at (u, v) of the reference: the mean over patches.
+
+    `index` [H, W] is the place of the reference's mapped pixels in the lists of sources and of what is borrowed [M].
+    `raw` [h, w, 3] and `rules` [h, w] come in as the warp gives them.
+    """
+    h0, w0 = reference.depth.shape
+    for k in range(lo, hi):
+        i, j = rows[k], cols[k]
+        u0, v0 = float(u[i, j]), float(v[i, j])
+        i0, j0 = int(v0), int(u0)
+        z0 = float(reference.depth[i0, j0])
+        total, sum0, sum1, sum2 = 0.0, 0.0, 0.0, 0.0
+        for dy in range(-radius, radius + 1):
+            for dx in range(-radius, radius + 1):
+                a, b = i0 + dy, j0 + dx
+                if a < 0 or b < 0 or a >= h0 or b >= w0 or index[a, b] < 0:
+                    continue
+                m = index[a, b]
+                if source_rules[m] == 0 or abs(reference.depth[a, b] - z0) > 2 * tolerance * z0:
+                    continue
+                # the patch at (a, b) explains this pixel by its source at the same place within the patch
+                uq, vq = source_cols[m] - dx + (u0 - j0), source_rows[m] - dy + (v0 - i0)
+                ut, vt, good = shown_at(uq, vq, reference, view, tolerance)
+                if not good:
+                    continue
+                weight = math.exp(-0.5 * (dx * dx + dy * dy))
+                total += weight
+                sum0 += weight * _bilinear(view.image, ut, vt, 0)
+                sum1 += weight * _bilinear(view.image, ut, vt, 1)
+                sum2 += weight * _bilinear(view.image, ut, vt, 2)
+        here = index[i0, j0]
+        if total > 0:
+            raw[i, j, 0], raw[i, j, 1], raw[i, j, 2] = sum0 / total, sum1 / total, sum2 / total
+            if rules[i, j] == REFERENCE:
+                rules[i, j] = OWN  # explained by its neighbours' patches
+        elif here >= 0 and has[here]:
+            raw[i, j, 0], raw[i, j, 1], raw[i, j, 2] = borrowed[here, 0], borrowed[here, 1], borrowed[here, 2]
+            rules[i, j] = OTHER
+        else:
+            rules[i, j] = REFERENCE
