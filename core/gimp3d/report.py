@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from string import Template
@@ -42,6 +42,7 @@ MEANINGS = {  # of the verdict's figures
 }
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
+PLOT_LOW, PLOT_HIGH = 56, 424  # px between which a plot of 480 px has its axes
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -181,46 +182,62 @@ def relief(
     return outlined(shaded, mask)
 
 
+@dataclass(frozen=True)
+class FitAxes:
+    """Where a plot shows (prior, disparity): nearly all pairs fill it, outliers stay outside."""
+
+    first: np.ndarray  # [2] at its lower left corner
+    last: np.ndarray  # [2] at its upper right one
+
+    @classmethod
+    def around(cls, ring: np.ndarray) -> FitAxes:
+        ends = np.percentile(ring, [1, 99], axis=0)
+        middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
+        return cls(middle - half, middle + half)
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [..., 2] of (prior, disparity)."""
+        share = (points - self.first) / (self.last - self.first)
+        return PLOT_LOW + (PLOT_HIGH - PLOT_LOW) * np.stack([share[..., 0], 1 - share[..., 1]], -1)
+
+    def line(self, line: np.ndarray) -> np.ndarray:
+        """Pixels [2, 2] of the ends of the line disparity = slope · prior + offset."""
+        return self.place(np.array([(m, line[0] * m + line[1]) for m in (self.first[0], self.last[0])]))
+
+
 def fit_plot(
     ring: np.ndarray,  # [N, 2] (prior, scene's disparity) of pixels round the hole
     line: np.ndarray,  # [2] (slope, offset) fitted to them
     scale: np.ndarray,  # s_f, one number: the slope as far as the prior is believed; 0 = it is not used
-    size: int = 480,  # px
 ) -> np.ndarray:
     """How s_f was measured: the scene's disparity over the prior, and the line fitted; [size, size, 3] uint8."""
     ink, faint, dots, drawn_line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
-    font, low, high = cv2.FONT_HERSHEY_SIMPLEX, 56, size - 56
-    drawn = np.full((size, size, 3), 255, np.uint8)
-    ends = np.percentile(ring, [1, 99], axis=0)  # outliers stay outside
-    middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
-    first, last = middle - half, middle + half
+    low, high, axes = PLOT_LOW, PLOT_HIGH, FitAxes.around(ring)
+    drawn = np.full((low + high, low + high, 3), 255, np.uint8)
 
-    def place(points: np.ndarray) -> np.ndarray:
-        """Pixels [..., 2] of (prior, disparity)."""
-        share = (points - first) / (last - first)
-        return np.stack([low + share[..., 0] * (high - low), high - share[..., 1] * (high - low)], -1)
+    def write(words: str, x: int, y: int, size: float = 0.38, colour: tuple[int, ...] = ink, width: int = 1) -> None:
+        cv2.putText(drawn, words, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
 
     for share in (0, 0.25, 0.5, 0.75, 1):
         at = round(low + share * (high - low))
-        value = first + share * (last - first)
+        value = axes.first + share * (axes.last - axes.first)
         cv2.line(drawn, (at, low), (at, high), faint, 1)
         cv2.line(drawn, (low, low + high - at), (high, low + high - at), faint, 1)
-        cv2.putText(drawn, f"{value[0]:.3g}", (at - 20, high + 20), font, 0.38, ink, 1, cv2.LINE_AA)
-        cv2.putText(drawn, f"{value[1]:.3g}", (6, low + high - at + 4), font, 0.38, ink, 1, cv2.LINE_AA)
-    inside = ((ring >= first) & (ring <= last)).all(1)
-    for x, y in np.rint(place(ring[inside])).astype(int):
+        write(f"{value[0]:.3g}", at - 20, high + 20)
+        write(f"{value[1]:.3g}", 6, low + high - at + 4)
+    inside = ((ring >= axes.first) & (ring <= axes.last)).all(1)
+    for x, y in np.rint(axes.place(ring[inside])).astype(int):
         cv2.circle(drawn, (int(x), int(y)), 1, dots, -1, cv2.LINE_AA)
-    fitted = place(np.array([(m, line[0] * m + line[1]) for m in (first[0], last[0])]))
+    fitted = axes.line(line)
     if np.abs(fitted).max() < 1e6:  # OpenCV's coordinates are short
         start, end = ((round(float(x)), round(float(y))) for x, y in fitted)
         seen, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), start, end)
         if seen:
             cv2.line(drawn, start, end, drawn_line, 2, cv2.LINE_AA)
     words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
-    words += f" (fitted {float(line[0]):.3g})"
-    cv2.putText(drawn, words, (low, 24), font, 0.55, drawn_line, 2, cv2.LINE_AA)
-    cv2.putText(drawn, "prior", (size // 2 - 16, size - 12), font, 0.45, ink, 1, cv2.LINE_AA)
-    cv2.putText(drawn, "disparity of the scene", (6, 46), font, 0.45, ink, 1, cv2.LINE_AA)
+    write(f"{words} (fitted {float(line[0]):.3g})", low, 24, 0.55, drawn_line, 2)
+    write("prior", (low + high) // 2 - 16, high + 44, 0.45)
+    write("disparity of the scene", 6, 46, 0.45)
     return drawn
 
 
