@@ -51,6 +51,16 @@ def build_parser() -> argparse.ArgumentParser:
         added.set_defaults(run=run)
         return added.add_argument
 
+    _scene_commands(command)
+    _remove_command(command)
+    _scoring_commands(command)
+    return parser
+
+
+Command = Callable[[Callable[[Namespace, "Reporter"], None], str], Callable[..., Any]]  # adds one; its add_argument
+
+
+def _scene_commands(command: Command) -> None:
     option = command(_info, "say what a scene file holds")
     option("scene", type=Path)
     option("--json", action="store_true", help="as JSON")
@@ -79,6 +89,17 @@ def build_parser() -> argparse.ArgumentParser:
     option("--frames", metavar="ID,ID", type=_names, help="only these cameras are written")
     _running(option)
 
+    option = command(_orbit, "make cameras round a region")
+    option("scene", type=Path)
+    option("--roi", required=True, type=Path)
+    option("--out", required=True, metavar="CAMS.json", type=Path)
+    option("--views", type=int, default=24)
+    option("--up", metavar="X,Y,Z", type=_three, help="default: away from the floor under the region")
+    option("--size", default="960x540", metavar="WxH", type=_size)
+    option("--fov", type=float, default=50.0, metavar="DEG", dest="fov_degrees", help="horizontal")
+
+
+def _remove_command(command: Command) -> None:
     option = command(_remove, "remove what lies in the region and fill the hole")
     option("scene", nargs="?")
     option("--cameras")
@@ -102,15 +123,8 @@ def build_parser() -> argparse.ArgumentParser:
     option("--seed", type=int, default=0)
     _running(option)
 
-    option = command(_orbit, "make cameras round a region")
-    option("scene", type=Path)
-    option("--roi", required=True, type=Path)
-    option("--out", required=True, metavar="CAMS.json", type=Path)
-    option("--views", type=int, default=24)
-    option("--up", metavar="X,Y,Z", type=_three, help="default: away from the floor under the region")
-    option("--size", default="960x540", metavar="WxH", type=_size)
-    option("--fov", type=float, default=50.0, metavar="DEG", dest="fov_degrees", help="horizontal")
 
+def _scoring_commands(command: Command) -> None:
     option = command(_evaluate, "score pictures against true ones")
     for name in ("--pred", "--truth", "--masks"):
         option(name, required=True, metavar="DIR", type=Path)
@@ -124,7 +138,6 @@ def build_parser() -> argparse.ArgumentParser:
     option("--scenes", default="", metavar="NAME,NAME", type=_names)
     option("--presets", default="balanced", metavar="NAME,NAME", type=_names)
     _running(option)
-    return parser
 
 
 def _scene_and_cameras(option: Callable[..., Any]) -> None:

@@ -267,17 +267,29 @@ def run_removal(
         allow_network,
     )
     result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
+    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
+    _write_beside(job, folder, scene, views, result, summary)
+    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
+    return summary
+
+
+def _write_beside(
+    job: RemovalJob,
+    folder: Path | None,
+    scene: Gaussians,
+    views: Sequence[View],
+    result: RemovalResult,
+    summary: dict[str, Any],
+) -> None:
+    """What a removal writes beside OUT: views, charts, report, summary."""
     if job.views_out:
         for name, image in result.painted.items():
             write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
         write_charts(Path(job.views_out) / "charts", result.charts)
-    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), scene, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_json(Path(path), summary)
-    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
-    return summary
 
 
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:
