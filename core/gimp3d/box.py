@@ -114,7 +114,7 @@ def box_from_matrix(
 
 
 def read_region(path: Path | str) -> Region:
-    """Read a ROI JSON: one box, or a list of boxes (CONTRACT: ROI).
+    """Read a ROI JSON: one box, or a list of boxes.
 
     Raises
     ------

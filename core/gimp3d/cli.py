@@ -1,4 +1,4 @@
-"""The command line (CONTRACT: gimp3d). Thin: reads files, calls the library, writes files, reports."""
+"""The command line, `gimp3d`. Thin: options here, files in `commands`, the work in the library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from . import __version__
 from .errors import BadInput, Cancelled, Gimp3dError, Terminated
-from .files import identity, user_state_folder, write_atomically
+from .files import identity, user_state_folder, write_atomically, write_json
 from .job import PROVIDERS, SHADOWS, RemovalJob, load_job, save_job
 from .memory import require_base_memory
 
@@ -31,11 +31,8 @@ DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH|torchscript:PATH|comman
 PAINTERS = "file:PATH|onnx:PATH[,WxH]|torchscript:PATH|gemini[:MODEL]|http://HOST:PORT|command:CMD"
 REFINERS = "asks command:CMD or http://HOST:PORT to refine the painted views, the completed reference beside them"
 NETWORK = "providers may send pictures of the scene to other machines (gemini, http: of another host)"
-IMAGES = "photos; none: views are rendered from the scene"
-GROW = "take along what of the object the boxes cut off"
-SHADOW = "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
-SHADOW_MASKS = "white pixels of DIR/<ID without extension>.png are the object's shadow (--shadow mask)"
-EXTRA_MASKS = "white pixels of DIR/<ID without extension>.png are filled too: shadows, reflections"
+MOST_LOGS = 20  # of unforeseen faults that are kept
+GIVEN_AGAIN = (*RemovalJob.PATHS, *PROVIDERS, "threads")  # what replaces a prepared job's
 
 
 class _Parser(argparse.ArgumentParser):
@@ -44,129 +41,160 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Every command and option of the contract."""
+    """Every command with its options; `run` among the values is what carries it out."""
     parser = _Parser(prog="gimp3d", description="Remove an object from a Gaussian splat scene and fill the hole.")
     parser.add_argument("--version", action="version", version=f"gimp3d {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
-    info = commands.add_parser("info", help="say what a scene file holds")
-    info.add_argument("scene")
-    info.add_argument("--json", action="store_true", help="as JSON")
+    def command(run: Callable[[Namespace, Reporter], None], words: str) -> Callable[..., Any]:
+        added = commands.add_parser(run.__name__.strip("_"), help=words)
+        added.set_defaults(run=run)
+        return added.add_argument
 
-    convert = commands.add_parser("convert", help="write a scene as an Inria-style PLY")
-    convert.add_argument("input", metavar="IN")
-    convert.add_argument("output", metavar="OUT")
-
-    draw = commands.add_parser("render", help="draw a scene from its cameras")
-    _scene_and_cameras(draw)
-    draw.add_argument("--out", required=True, metavar="DIR")
-    draw.add_argument("--split", choices=("train", "test", "all"), default="all")
-    draw.add_argument("--frames", metavar="ID,ID", help="only these cameras")
-    draw.add_argument("--passes", default="rgb", metavar="rgb,alpha,depth,normal")
-    draw.add_argument("--scale", type=float, default=1.0, help="resolution factor")
-    draw.add_argument("--background", default="0,0,0", metavar="R,G,B", help="0–1 each")
-    _running(draw)
-
-    masks = commands.add_parser("masks", help="write the region to fill in every view")
-    _scene_and_cameras(masks)
-    masks.add_argument("--roi", required=True)
-    masks.add_argument("--out", required=True, metavar="DIR")
-    masks.add_argument("--images", metavar="DIR|none", help=IMAGES)
-    masks.add_argument("--grow", action="store_true", help=GROW)
-    masks.add_argument("--mode", choices=("need", "paper"), default="need")
-    masks.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
-    masks.add_argument("--shadow", choices=SHADOWS, default="auto", help=SHADOW)
-    masks.add_argument("--shadow-masks", metavar="DIR", help=SHADOW_MASKS)
-    masks.add_argument(
-        "--pictures",
-        metavar="DIR",
-        help="also draw the region over each view, the surface that would be completed, and the charts",
-    )
-    masks.add_argument("--depth-prior", default="auto", metavar="PROVIDER", help=DEPTH_PRIORS)
-    masks.add_argument("--split", choices=("train", "test", "all"), default="train")
-    masks.add_argument("--frames", metavar="ID,ID", help="only these cameras are written")
-    _running(masks)
-
-    remove = commands.add_parser("remove", help="remove what lies in the region and fill the hole")
-    remove.add_argument("scene", nargs="?")
-    remove.add_argument("--cameras")
-    remove.add_argument("--roi")
-    remove.add_argument("--out", metavar="OUT.ply")
-    remove.add_argument("--images", metavar="DIR|none", help=IMAGES)
-    remove.add_argument("--grow", action="store_true", help=GROW)
-    remove.add_argument("--extra-masks", metavar="DIR", help=EXTRA_MASKS)
-    remove.add_argument("--shadow", choices=SHADOWS, default="auto", help=SHADOW)
-    remove.add_argument("--shadow-masks", metavar="DIR", help=SHADOW_MASKS)
-    remove.add_argument(
-        "--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)"
-    )
-    remove.add_argument("--reference-image", metavar="FILE", help="that view or chart without the object")
-    remove.add_argument(
-        "--inpaint",
-        metavar="PROVIDER",
-        help=f"exemplar|telea|ns|shiftmap|fsr|{PAINTERS}",
-    )
-    remove.add_argument("--depth-prior", metavar="PROVIDER", help=DEPTH_PRIORS)
-    remove.add_argument("--refine-views", metavar="PROVIDER", help=REFINERS)
-    remove.add_argument("--allow-network", action="store_true", help=NETWORK)
-    remove.add_argument("--preset", default="balanced", help="draft|balanced|best|paper")
-    remove.add_argument("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
-    remove.add_argument("--views-out", metavar="DIR", help="write every completed view")
-    remove.add_argument("--report", metavar="DIR", help="write an HTML report with stage pictures")
-    remove.add_argument("--summary", metavar="FILE.json")
-    remove.add_argument("--job", metavar="DIR", help="keep every stage here; alone: run the job prepared there")
-    remove.add_argument("--allow-command", action="store_true", help="run the command that the job in --job names")
-    remove.add_argument("--resume", action="store_true", help="go on from the finished stages in --job")
-    remove.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    remove.add_argument("--seed", type=int, default=0)
-    _running(remove)
-
-    orbit = commands.add_parser("orbit", help="make cameras round a region")
-    orbit.add_argument("scene")
-    orbit.add_argument("--roi", required=True)
-    orbit.add_argument("--out", required=True, metavar="CAMS.json")
-    orbit.add_argument("--views", type=int, default=24)
-    orbit.add_argument("--up", metavar="X,Y,Z", help="default: away from the floor under the region")
-    orbit.add_argument("--size", default="960x540", metavar="WxH")
-    orbit.add_argument("--fov", type=float, default=50.0, metavar="DEG", help="horizontal")
-
-    evaluate = commands.add_parser("evaluate", help="score pictures against true ones")
-    evaluate.add_argument("--pred", required=True, metavar="DIR")
-    evaluate.add_argument("--truth", required=True, metavar="DIR")
-    evaluate.add_argument("--masks", required=True, metavar="DIR")
-    evaluate.add_argument("--mask-suffix", default=".mask.png")
-    evaluate.add_argument("--exclude", default="", metavar="ID,ID")
-    evaluate.add_argument("--json", metavar="FILE")
-
-    bench = commands.add_parser("bench", help="score removals on scenes with ground truth, beside baselines")
-    bench.add_argument("data", metavar="DATA", help="folder of scenes, each with truth/")
-    bench.add_argument("--out", required=True, metavar="DIR", help="where results and pictures go")
-    bench.add_argument("--scenes", metavar="NAME,NAME")
-    bench.add_argument("--presets", default="balanced", metavar="NAME,NAME")
-    _running(bench)
+    _scene_commands(command)
+    _remove_command(command)
+    _scoring_commands(command)
     return parser
 
 
-def _scene_and_cameras(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene")
-    parser.add_argument("--cameras", required=True, help="transforms.json, COLMAP folder, or cameras.json")
+Command = Callable[[Callable[[Namespace, "Reporter"], None], str], Callable[..., Any]]  # adds one; its add_argument
 
 
-def _running(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--threads", type=int, metavar="N", help="default: one per core")
-    parser.add_argument("--progress", choices=("bar", "json", "none"), default="bar")
-    parser.add_argument("--quiet", action="store_true", help="no progress, no summary text")
+def _scene_commands(command: Command) -> None:
+    option = command(_info, "say what a scene file holds")
+    option("scene", type=Path)
+    option("--json", action="store_true", help="as JSON")
+
+    option = command(_convert, "write a scene as an Inria-style PLY")
+    option("source", metavar="IN", type=Path)
+    option("target", metavar="OUT", type=Path)
+
+    option = command(_render, "draw a scene from its cameras")
+    _scene_and_cameras(option)
+    option("--split", choices=("train", "test", "all"), default="all")
+    option("--frames", metavar="ID,ID", type=_names, help="only these cameras")
+    option("--passes", type=_names, default="rgb", metavar="rgb,alpha,depth,normal")
+    option("--scale", type=float, default=1.0, help="resolution factor")
+    option("--background", type=_three, default="0,0,0", metavar="R,G,B", help="0–1 each")
+    _running(option)
+
+    option = command(_masks, "write the region to fill in every view")
+    _scene_and_cameras(option)
+    option("--roi", required=True, type=Path)
+    _object(option)
+    option("--mode", choices=("need", "paper"), default="need")
+    words = "also draw the region over each view, the surface that would be completed, and the charts"
+    option("--pictures", metavar="DIR", type=Path, help=words)
+    option("--split", choices=("train", "test", "all"), default="train")
+    option("--frames", metavar="ID,ID", type=_names, help="only these cameras are written")
+    _running(option)
+
+    option = command(_orbit, "make cameras round a region")
+    option("scene", type=Path)
+    option("--roi", required=True, type=Path)
+    option("--out", required=True, metavar="CAMS.json", type=Path)
+    option("--views", type=int, default=24)
+    option("--up", metavar="X,Y,Z", type=_three, help="default: away from the floor under the region")
+    option("--size", default="960x540", metavar="WxH", type=_size)
+    option("--fov", type=float, default=50.0, metavar="DEG", dest="fov_degrees", help="horizontal")
+
+
+def _remove_command(command: Command) -> None:
+    option = command(_remove, "remove what lies in the region and fill the hole")
+    option("scene", nargs="?")
+    option("--cameras")
+    option("--roi")
+    option("--out", metavar="OUT.ply")
+    _object(option)
+    option("--reference", metavar="ID|chart:N", help="the view or chart to complete first (default: chosen)")
+    option("--reference-image", metavar="FILE", help="that view or chart without the object")
+    option("--inpaint", metavar="PROVIDER", help=f"exemplar|telea|ns|shiftmap|fsr|{PAINTERS}")
+    option("--refine-views", metavar="PROVIDER", help=REFINERS)
+    option("--allow-network", action="store_true", help=NETWORK)
+    option("--preset", default="balanced", help="draft|balanced|best|paper")
+    option("--set", action="append", default=[], metavar="key=value", help="one setting, stage.name=value")
+    option("--views-out", metavar="DIR", help="write every completed view")
+    option("--report", metavar="DIR", help="write an HTML report with stage pictures")
+    option("--summary", metavar="FILE.json")
+    option("--job", metavar="DIR", type=Path, help="keep every stage here; alone: run the job prepared there")
+    option("--allow-command", action="store_true", help="run the command that the job in --job names")
+    option("--resume", action="store_true", help="go on from the finished stages in --job")
+    option("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    option("--seed", type=int, default=0)
+    _running(option)
+
+
+def _scoring_commands(command: Command) -> None:
+    option = command(_evaluate, "score pictures against true ones")
+    for name in ("--pred", "--truth", "--masks"):
+        option(name, required=True, metavar="DIR", type=Path)
+    option("--mask-suffix", default=".mask.png")
+    option("--exclude", default="", metavar="ID,ID", type=_names)
+    option("--json", metavar="FILE", type=Path)
+
+    option = command(_bench, "score removals on scenes with ground truth, beside baselines")
+    option("data", metavar="DATA", type=Path, help="folder of scenes, each with truth/")
+    option("--out", required=True, metavar="DIR", type=Path, help="where results and pictures go")
+    option("--scenes", default="", metavar="NAME,NAME", type=_names)
+    option("--presets", default="balanced", metavar="NAME,NAME", type=_names)
+    _running(option)
+
+
+def _scene_and_cameras(option: Callable[..., Any]) -> None:
+    option("scene", type=Path)
+    option("--cameras", required=True, type=Path, help="transforms.json, COLMAP folder, or cameras.json")
+    option("--out", required=True, metavar="DIR", type=Path)
+
+
+def _object(option: Callable[..., Any]) -> None:
+    """What goes with the object: options of `masks` and `remove`."""
+    shadow = "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
+    option("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
+    option("--grow", action="store_true", help="take along what of the object the boxes cut off")
+    option("--extra-masks", metavar="DIR", help="white pixels of its pictures are filled too: shadows, reflections")
+    option("--shadow", choices=SHADOWS, default="auto", help=shadow)
+    words = "white pixels of DIR/<ID without extension>.png are the object's shadow (--shadow mask)"
+    option("--shadow-masks", metavar="DIR", help=words)
+    option("--depth-prior", metavar="PROVIDER", help=DEPTH_PRIORS)
+
+
+def _running(option: Callable[..., Any]) -> None:
+    """How commands that need the kernels are run."""
+    option("--threads", type=int, metavar="N", help="default: one per core")
+    option("--progress", choices=("bar", "json", "none"), default="bar")
+    option("--quiet", action="store_true", help="no progress, no summary text")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(n.strip() for n in text.split(",") if n.strip())
+
+
+def _three(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(v) for v in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(abs(v) < float("inf") for v in values):
+        raise argparse.ArgumentTypeError(f"3 numbers separated by commas expected, got {text!r}")
+    return values
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found:
+        raise argparse.ArgumentTypeError(f"WIDTHxHEIGHT expected, got {text!r}")
+    return int(found[1]), int(found[2])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code (CONTRACT: 0, 1, 2, 3, 129, 130, 143)."""
+    """Run a command; returns the exit code: 0, 1, 2, 3, 129, 130 or 143."""
     shown = Reporter("none")
     try:
         given = build_parser().parse_args(arguments)
         shown = Reporter("none" if getattr(given, "quiet", False) else getattr(given, "progress", "none"))
-        if given.command in COMPILED:
+        if hasattr(given, "threads"):  # the kernels are needed
             require_base_memory()
-        COMMANDS[given.command](given, shown)
+        given.run(given, shown)
         return 0
     except Gimp3dError as error:
         return _fail(shown, error.exit_code, str(error))
@@ -237,75 +265,50 @@ class Reporter:
             say(json.dumps({"stage": "error", "message": message}), sys.stdout)
 
 
+def _values(given: Namespace, *others: str) -> dict[str, Any]:
+    """The options that were given, as the keywords of the function that a command calls."""
+    own = {"command", "run", "progress", "quiet", *others}
+    return {name: value for name, value in vars(given).items() if value is not None and name not in own}
+
+
 def _info(given: Namespace, _: Reporter) -> None:
     from .commands import scene_info
 
-    facts = scene_info(Path(given.scene))
-    if given.json:
-        say(json.dumps(facts, indent=1), sys.stdout)
-    else:
-        for key, value in facts.items():
-            say(f"{key.replace('_', ' '):<22} {value}", sys.stdout)
+    facts = scene_info(given.scene)
+    lines = (f"{key.replace('_', ' '):<22} {value}" for key, value in facts.items())
+    say(json.dumps(facts, indent=1) if given.json else "\n".join(lines), sys.stdout)
 
 
 def _convert(given: Namespace, _: Reporter) -> None:
     from .commands import convert
 
-    convert(Path(given.input), Path(given.output))
+    convert(**_values(given))
 
 
 def _render(given: Namespace, shown: Reporter) -> None:
     from .commands import render_views
 
-    render_views(
-        Path(given.scene),
-        Path(given.cameras),
-        Path(given.out),
-        split=given.split,
-        frames=_names(given.frames),
-        passes=tuple(_names(given.passes) or ()),
-        scale=given.scale,
-        background=_numbers(given.background, 3, "--background"),
-        threads=given.threads,
-        progress=shown,
-    )
+    render_views(**_values(given), progress=shown)
 
 
 def _masks(given: Namespace, shown: Reporter) -> None:
     from .commands import write_masks
 
-    write_masks(
-        Path(given.scene),
-        Path(given.cameras),
-        Path(given.roi),
-        Path(given.out),
-        images=given.images,
-        mode=given.mode,
-        grow=given.grow,
-        split=given.split,
-        frames=_names(given.frames),
-        extra_masks=Path(given.extra_masks) if given.extra_masks else None,
-        shadow=given.shadow,
-        shadow_masks=Path(given.shadow_masks) if given.shadow_masks else None,
-        pictures=Path(given.pictures) if given.pictures else None,
-        depth_prior=given.depth_prior,
-        threads=given.threads,
-        progress=shown,
-    )
+    write_masks(**_values(given), progress=shown)
 
 
 def _remove(given: Namespace, shown: Reporter) -> None:
-    from .commands import job_settings, run_removal
+    from .commands import run_removal
     from .pipeline import provider_notices
+    from .settings import job_settings
 
-    folder = Path(given.job) if given.job else None
-    job = _job(given, folder)
+    job = _job(given)
     before = identity(Path(job.out))
     start = time.perf_counter()
     for notice in provider_notices(job_settings(job), given.allow_network):
         print(f"gimp3d: note: {notice}", file=sys.stderr)
     try:
-        summary = run_removal(job, folder, given.resume, shown, given.allow_network)
+        summary = run_removal(job, given.job, given.resume, shown, given.allow_network)
     except KeyboardInterrupt:
         if identity(Path(job.out)) in (before, None):
             raise
@@ -324,55 +327,40 @@ def _remove(given: Namespace, shown: Reporter) -> None:
             say(f"gimp3d: warning: {warning}", sys.stderr)
 
 
-def _job(given: Namespace, folder: Path | None) -> RemovalJob:
+def _job(given: Namespace) -> RemovalJob:
     """The removal that the options describe, or the one that is prepared in the folder."""
-    options = {f: getattr(given, f) for f in RemovalJob.__dataclass_fields__ if f != "set"}
-    options = {f: value for f, value in options.items() if value is not None}
+    options = {f: v for f, v in _values(given, "set").items() if f in RemovalJob.__dataclass_fields__}
     missing = [f"--{k}" if k != "scene" else "SCENE" for k in ("scene", "cameras", "roi", "out") if k not in options]
-    if folder and missing and (given.scene is None or (folder / "job.json").is_file()):
+    if given.job and missing and (given.scene is None or (given.job / "job.json").is_file()):
         again = {f: value for f, value in options.items() if f in GIVEN_AGAIN}
-        return load_job(folder, again, given.allow_command)
+        return load_job(given.job, again, given.allow_command)
     if missing:
         raise BadInput(f"remove needs {', '.join(missing)} (or --job DIR alone, to run a prepared job)")
-    if given.resume and not folder:
+    if given.resume and not given.job:
         raise BadInput("--resume needs --job DIR, the folder of the run to go on with")
-    job = RemovalJob(**options, set=_settings(given.set))
-    if folder:
-        save_job(folder, job)
+    for pair in given.set:
+        if "=" not in pair:
+            raise BadInput(f"--set: key=value expected, got {pair!r}")
+    job = RemovalJob(**options, set=dict(p.split("=", 1) for p in given.set))
+    if given.job:
+        save_job(given.job, job)
     return job
 
 
 def _orbit(given: Namespace, _: Reporter) -> None:
     from .commands import write_orbit
 
-    size = re.fullmatch(r"(\d+)x(\d+)", given.size)
-    if not size:
-        raise BadInput(f"--size: WIDTHxHEIGHT expected, got {given.size!r}")
-    up, why = write_orbit(
-        Path(given.scene),
-        Path(given.roi),
-        Path(given.out),
-        views=given.views,
-        up=_numbers(given.up, 3, "--up") if given.up is not None else None,
-        width=int(size[1]),
-        height=int(size[2]),
-        fov_degrees=given.fov,
-    )
+    width, height = given.size
+    up, why = write_orbit(**_values(given, "size"), width=width, height=height)
     say(f"{given.out}: {given.views} cameras; up is {up[0]:.2f},{up[1]:.2f},{up[2]:.2f} ({why})", sys.stdout)
 
 
 def _evaluate(given: Namespace, _: Reporter) -> None:
     from .evaluate.metrics import evaluate_folders
 
-    scores = evaluate_folders(
-        Path(given.pred),
-        Path(given.truth),
-        Path(given.masks),
-        mask_suffix=given.mask_suffix,
-        exclude=tuple(_names(given.exclude) or ()),
-    )
+    scores = evaluate_folders(**_values(given, "json"))
     if given.json:
-        write_atomically(Path(given.json), lambda f: f.write(json.dumps(scores, indent=1).encode()))
+        write_json(given.json, scores)
     for warning in scores["warnings"]:
         say(f"gimp3d: warning: {warning}", sys.stderr)
     say(f"{'view':<20} {'PSNR dB':>8} {'SSIM':>7} {'FLIP':>7}", sys.stdout)
@@ -385,49 +373,11 @@ def _bench(given: Namespace, shown: Reporter) -> None:
     from .evaluate.benchmark import run_benchmark, table
     from .pipeline import PRESETS
 
-    presets = _names(given.presets) or ()
-    unknown = [p for p in presets if p not in PRESETS]
+    unknown = [p for p in given.presets if p not in PRESETS]
     if unknown:
         raise BadInput(f"--presets: no preset {', '.join(unknown)}; there are {', '.join(PRESETS)}")
     set_thread_count(given.threads)
-    rows = run_benchmark(Path(given.data), Path(given.out), _names(given.scenes) or (), presets, shown)
-    say(table(rows), sys.stdout)
-
-
-COMPILED = {"render", "masks", "remove", "bench"}  # commands that need the kernels
-MOST_LOGS = 20
-GIVEN_AGAIN = (*RemovalJob.PATHS, *PROVIDERS, "threads")  # what replaces a prepared job's
-COMMANDS = {
-    "info": _info,
-    "convert": _convert,
-    "render": _render,
-    "masks": _masks,
-    "remove": _remove,
-    "orbit": _orbit,
-    "evaluate": _evaluate,
-    "bench": _bench,
-}
-
-
-def _names(text: str | None) -> tuple[str, ...] | None:
-    return tuple(n.strip() for n in text.split(",") if n.strip()) if text else None
-
-
-def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
-    try:
-        values = tuple(float(v) for v in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != count or not all(abs(v) < float("inf") for v in values):
-        raise BadInput(f"{option}: {count} numbers separated by commas expected, got {text!r}")
-    return values
-
-
-def _settings(pairs: Sequence[str]) -> dict[str, str]:
-    for pair in pairs:
-        if "=" not in pair:
-            raise BadInput(f"--set: key=value expected, got {pair!r}")
-    return dict(p.split("=", 1) for p in pairs)
+    say(table(run_benchmark(given.data, given.out, given.scenes, given.presets, shown)), sys.stdout)
 
 
 def entry_point() -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,23 +18,23 @@ from .camera import Camera, output_name
 from .compute.jit import announce_compilation
 from .compute.threads import parallel_map, set_thread_count
 from .errors import BadInput
-from .files import is_stream, sweep, try_target, write_atomically
+from .files import is_stream, sweep, try_target, write_atomically, write_json
 from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
-from .job import SHADOWS, RemovalJob
-from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
+from .job import RemovalJob
+from .memory import GAUSSIAN, VIEW_PIXEL, peak_memory_mb, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
-from .pipeline import PRESETS, RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
+from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
 from .run import Run
-from .schema import within
+from .settings import job_settings, shadow_of
 from .stages.charts import Chart, chart_number
 from .stages.completion import charts_to_paint
 from .stages.light import NOT_LIT
@@ -110,7 +109,7 @@ def render_views(
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
-    """Draw the scene from its cameras into `out` (CONTRACT: render)."""
+    """Draw the scene from its cameras: `out`/<ID without extension>.png (rgb), .alpha.png, .depth.npy, .normal.npy."""
     _use_threads(threads)
     unknown = [p for p in passes if p not in PASSES]
     if unknown or not passes:
@@ -128,15 +127,15 @@ def render_views(
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
     for done, camera in enumerate(chosen, 1):
         drawn = render(gaussians, frame.camera(undistorted(camera).scaled(scale)), raster, frozenset(passes))
-        target = out / output_name(camera.id)
+        name = output_name(camera.id)
         if "rgb" in passes:
-            write_png(target.with_name(target.name + ".png"), to_bytes(drawn.rgb))
+            write_png(out / f"{name}.png", to_bytes(drawn.rgb))
         if "alpha" in passes:
-            write_png(target.with_name(target.name + ".alpha.png"), to_bytes(drawn.alpha))
+            write_png(out / f"{name}.alpha.png", to_bytes(drawn.alpha))
         if "depth" in passes:
-            _write_npy(target.with_name(target.name + ".depth.npy"), drawn.median_depth / np.float32(frame.scale))
+            _write_npy(out / f"{name}.depth.npy", drawn.median_depth / np.float32(frame.scale))
         if "normal" in passes:
-            _write_npy(target.with_name(target.name + ".normal.npy"), drawn.normals)
+            _write_npy(out / f"{name}.normal.npy", drawn.normals)
         progress("render", done, len(chosen), camera.id)
 
 
@@ -146,19 +145,19 @@ def write_masks(
     roi: Path,
     out: Path,
     images: str | None = None,  # folder; "none": views are rendered from the scene itself
-    mode: Literal["need", "paper"] = "need",
+    mode: str = "need",  # need | paper
     grow: bool = False,
     split: str = "train",
     frames: Sequence[str] | None = None,
-    extra_masks: Path | None = None,
+    extra_masks: Path | str | None = None,
     shadow: str = "auto",
-    shadow_masks: Path | None = None,
+    shadow_masks: Path | str | None = None,
     pictures: Path | None = None,
     depth_prior: str = "auto",
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
-    """Write every view's target region as a 0/255 picture (CONTRACT: masks).
+    """Write every view's target region as a 0/255 picture, `out`/<ID without extension>.png.
 
     With `pictures`, also what a removal would do there: <ID>.mask.png, the region laid over the view; <ID>.depth.png,
     the surface that it would complete as a relief; <ID>.fit.png, how the depth prior was scaled, if there is one;
@@ -178,17 +177,10 @@ def write_masks(
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     loaded, _ = _load_views(looked_at, images, gaussians, frame)
     photos = {v.camera.id: v.image for v in loaded}
-    settings = RemovalSettings(masks=MaskSettings(mode=mode, grow=grow), depth_prior=depth_prior)
-    settings = replace(settings, shadow=_shadow(shadow, shadow_masks))
-    found = find_masks(
-        gaussians,
-        region,
-        [v.camera for v in loaded],
-        settings.masks,
-        progress,
-        photos,
-        _read_marks("--extra-masks", extra_masks, looked_at),
-    )
+    masks = MaskSettings(mode=mode, grow=grow)  # type: ignore[arg-type]
+    settings = RemovalSettings(masks=masks, depth_prior=depth_prior, shadow=shadow_of(shadow, shadow_masks))
+    extra = _read_marks("--extra-masks", extra_masks, looked_at)
+    found = find_masks(gaussians, region, [v.camera for v in loaded], masks, progress, photos, extra)
     marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
     views: dict[str, ViewState] = {}
     charts: tuple[Chart, ...] = ()
@@ -198,23 +190,19 @@ def write_masks(
         views = {v.id: v for v in behind.views}
         charts, lit = charts_to_paint(behind.charts, behind.views), behind.lit
     if pictures:
-        proposed = json.dumps(_proposed(found.proposed, frame))
-        write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
-    if pictures:
-        light = json.dumps({"shadow": lit.shadow, "reflection": lit.reflection})
-        write_atomically(pictures / "light.json", lambda f: f.write(light.encode()))
-    if pictures and all(c.split == "train" for c in written):
-        write_charts(pictures / "charts", _charts_back(charts, frame))
+        write_json(pictures / "proposed.json", _proposed(found.proposed, frame))
+        write_json(pictures / "light.json", {"shadow": lit.shadow, "reflection": lit.reflection})
+        if all(c.split == "train" for c in written):
+            write_charts(pictures / "charts", _charts_back(charts, frame))
     for camera in written:
         view = views.get(camera.id)
-        empty = np.zeros((camera.height, camera.width), bool)
-        target = out / output_name(camera.id)
-        write_png(target.with_name(target.name + ".png"), view.masks.target if view else empty)
+        name = output_name(camera.id)
+        target = view.masks.target if view else np.zeros((camera.height, camera.width), bool)
+        write_png(out / f"{name}.png", target)
         if pictures and view:
-            target = pictures / output_name(camera.id)
             shown = preview(view, list(views.values()), settings)
             for looked in (*shown, *of_light(lit, list(views), [camera.id])):
-                write_png(target.with_name(f"{target.name}.{looked.kind}.png"), draw(looked))
+                write_png(pictures / f"{name}.{looked.kind}.png", draw(looked))
 
 
 def write_orbit(
@@ -227,10 +215,10 @@ def write_orbit(
     height: int = 540,
     fov_degrees: float = 50.0,
 ) -> tuple[np.ndarray, str]:
-    """Write cameras round a region, for a scene that has none (CONTRACT: orbit); returns what is up, and why."""
+    """Write cameras round a region, for a scene that has none; returns what is up, and why."""
     file, region = read_scene(scene), read_region(roi)
     gaussians = replace(file.gaussians, means=positions(file))
-    axis: Any = up
+    axis = None if up is None else np.asarray(up)
     why = "as given"
     if axis is None:
         axis, why = measured_up(gaussians, region), "away from the floor under the region"
@@ -247,7 +235,7 @@ def run_removal(
     progress: Progress = silent,
     allow_network: bool = False,  # never the job's to say: it may come from somebody else
 ) -> dict[str, Any]:
-    """Run a removal from files to files; returns the summary (CONTRACT: remove, --summary)."""
+    """Run a removal from files to files; returns the summary."""
     start = time.perf_counter()
     _use_threads(job.threads)
     if job.device == "cuda":
@@ -263,7 +251,7 @@ def run_removal(
     cameras = _removal_cameras(job)
     pixels = sum(c.width * c.height for c in cameras)
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
-    warnings = list(_scene_warnings(file))
+    warnings = _scene_warnings(file)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     frame = frame_of(file, cameras)
     scene = frame.scene(file)
@@ -271,10 +259,8 @@ def run_removal(
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     given = read_image(Path(job.reference_image)) if job.reference_image else None
-    extra, shadow = (
-        _read_marks(option, Path(folder) if folder else None, cameras)
-        for option, folder in (("--extra-masks", job.extra_masks), ("--shadow-masks", job.shadow_masks))
-    )
+    extra = _read_marks("--extra-masks", job.extra_masks, cameras)
+    shadow = _read_marks("--shadow-masks", job.shadow_masks, cameras)
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     store = None
     if folder:
@@ -294,18 +280,29 @@ def run_removal(
         allow_network,
     )
     result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
+    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
+    _write_beside(job, folder, scene, views, result, summary)
+    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
+    return summary
+
+
+def _write_beside(
+    job: RemovalJob,
+    folder: Path | None,
+    scene: Gaussians,
+    views: Sequence[View],
+    result: RemovalResult,
+    summary: dict[str, Any],
+) -> None:
+    """What a removal writes beside OUT: views, charts, report, summary."""
     if job.views_out:
         for name, image in result.painted.items():
-            target = Path(job.views_out) / output_name(name)
-            write_png(target.with_name(target.name + ".png"), image)
+            write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
         write_charts(Path(job.views_out) / "charts", result.charts)
-    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
     if job.report:
         write_removal_report(Path(job.report), scene, views, result, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
-        write_atomically(Path(path), lambda f: f.write(json.dumps(summary, indent=1).encode()))
-    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
-    return summary
+        write_json(Path(path), summary)
 
 
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:
@@ -317,66 +314,6 @@ def _try_targets(job: RemovalJob, folder: Path | None) -> None:
         try_target(path)
     for path in folders:
         try_target(path, is_folder=True)
-
-
-def job_settings(job: RemovalJob) -> RemovalSettings:
-    """The preset's settings with the job's own on top.
-
-    Raises
-    ------
-    BadInput
-        If a key of --set does not exist or its value is of the wrong type.
-    """
-    if job.preset not in PRESETS:
-        raise BadInput(f"--preset: {job.preset!r} is not in this version; use {', '.join(PRESETS)}")
-    if not 0 <= job.seed < 1 << 32:
-        raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
-    settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
-    settings = replace(settings, refine_views=job.refine_views or "")
-    settings = replace(settings, masks=replace(settings.masks, grow=job.grow))
-    shadow = _shadow(job.shadow, job.shadow_masks)
-    if settings.shadow == "off" and shadow == "mask":
-        raise BadInput(f"--shadow mask: the preset {job.preset} leaves shadows alone; use another preset")
-    if settings.shadow != "off":
-        settings = replace(settings, shadow=shadow)
-    for key, text in job.set.items():
-        settings = _with(settings, key.split("."), text, key)
-    within(settings, "--set: ")
-    return settings
-
-
-def _shadow(shadow: str, masks: Path | str | None) -> Any:
-    if shadow not in SHADOWS:
-        raise BadInput(f"--shadow: {shadow!r} is not one of {', '.join(SHADOWS)}")
-    if (shadow == "mask") != (masks is not None):
-        raise BadInput("--shadow mask and --shadow-masks DIR go together")
-    return shadow
-
-
-def _with(settings: Any, path: Sequence[str], text: str, key: str) -> Any:
-    names = [f.name for f in fields(settings)]
-    if path[0] not in names:
-        raise BadInput(f"--set: no setting {key!r}; {type(settings).__name__} has {', '.join(names)}")
-    value = getattr(settings, path[0])
-    if is_dataclass(value) and len(path) > 1:
-        return replace(settings, **{path[0]: _with(value, path[1:], text, key)})
-    if is_dataclass(value) or len(path) > 1:
-        raise BadInput(f"--set: {key!r} is not a single setting")
-    try:
-        new = _parse_like(value, text)
-    except ValueError:
-        raise BadInput(f"--set: {key} takes a {type(value).__name__}, got {text!r}") from None
-    return replace(settings, **{path[0]: new})
-
-
-def _parse_like(value: Any, text: str) -> Any:
-    if isinstance(value, bool):
-        if text.lower() not in ("true", "false", "0", "1"):
-            raise ValueError(text)
-        return text.lower() in ("true", "1")
-    if value is None:
-        return None if text == "none" else float(text)
-    return type(value)(text)
 
 
 def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
@@ -427,11 +364,11 @@ def _charts_back(charts: Sequence[Chart], frame: Frame) -> tuple[Chart, ...]:
     return tuple(replace(chart, camera=camera) for chart, camera in zip(charts, back))
 
 
-def _read_marks(option: str, folder: Path | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
     """The masks of a folder by camera ID, undistorted and resampled like photos; views may lack one."""
     if folder is None:
         return {}
-    paths = {c.id: folder / f"{output_name(c.id)}.png" for c in cameras}
+    paths = {c.id: Path(folder) / f"{output_name(c.id)}.png" for c in cameras}
     masks = {c.id: load_view(replace(c, image=paths[c.id]))[0].max(-1) > 127 for c in cameras if paths[c.id].is_file()}
     if not masks:
         raise BadInput(f"{option}: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
@@ -440,12 +377,9 @@ def _read_marks(option: str, folder: Path | None, cameras: Sequence[Camera]) -> 
 
 def _scene_warnings(file: SplatFile) -> list[str]:
     unusable = int((~file.gaussians.usable).sum())
-    found = []
-    if unusable:
-        found.append(f"{unusable} Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file")
-    if file.gaussians.is_surfels:
-        found.append("2DGS scene: surfels are drawn as flat Gaussians in this version")
-    return found
+    if not unusable:
+        return []
+    return [f"{unusable} Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"]
 
 
 def _summary(
@@ -503,19 +437,9 @@ def _cost(file: SplatFile, added: Gaussians | None) -> dict[str, int]:
     highest = np.ceil(np.sqrt(used.shape[1] - used[:, ::-1].argmax(1))).astype(int) - 1
     degrees = np.where(used.any(1), highest, 0)
     cost = {f"added_of_degree_{d}": int((degrees == d).sum()) for d in range(added.sh_degree + 1)}
-    return (
-        cost if file.table.format == "ascii" else {"added_bytes": len(added) * file.table.rows.dtype.itemsize, **cost}
-    )
-
-
-def peak_memory_mb() -> float:
-    """The largest resident size of this process so far; 0 where the system does not tell (Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return 0.0
-    unit = 1024**2 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    if file.table.format == "ascii":
+        return cost
+    return {"added_bytes": len(added) * file.table.rows.dtype.itemsize, **cost}
 
 
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:

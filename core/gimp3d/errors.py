@@ -1,4 +1,4 @@
-"""Errors that end as one clear line. Each names the exit code of the command line (CONTRACT: exit codes)."""
+"""Errors that end as one clear line. Each names the exit code of the command line."""
 
 
 class Gimp3dError(Exception):
@@ -14,7 +14,7 @@ class BadInput(Gimp3dError):
 
 
 class IllPosed(Gimp3dError):
-    """The input is legal but the task has no defined answer (METHOD section 8)."""
+    """The input is legal but the task has no defined answer (docs/method.md)."""
 
     exit_code = 3
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import stat
@@ -76,6 +77,11 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
             raise
     except OSError as error:
         raise BadInput(f"cannot write {path} ({error.strerror or error})") from None
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a JSON file as `write_atomically` does."""
+    write_atomically(path, lambda f: f.write(json.dumps(document, indent=1).encode()))
 
 
 def try_target(path: Path, is_folder: bool = False) -> None:

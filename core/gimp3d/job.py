@@ -32,7 +32,7 @@ SHADOWS = ("auto", "off", "mask")  # what the object's own shadow is taken for
 
 @dataclass(frozen=True)
 class RemovalJob:
-    """What `gimp3d remove` was asked to do; the fields are the command line's (CONTRACT: remove)."""
+    """What `gimp3d remove` was asked to do; the fields are the command line's."""
 
     scene: str
     cameras: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -46,3 +47,13 @@ def require_memory(needed: float, what: str, addresses: float | None = None) -> 
 def require_base_memory() -> None:
     """Raise MemoryError if the kernels could not be loaded or compiled."""
     require_memory(BASE, "gimp3d", BASE_ADDRESSES)
+
+
+def peak_memory_mb() -> float:
+    """The largest resident size of this process so far; 0 where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    unit = 1024**2 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

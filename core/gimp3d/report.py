@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import cv2
@@ -41,6 +42,7 @@ MEANINGS = {  # of the verdict's figures
 }
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
+PLOT_LOW, PLOT_HIGH = 56, 424  # px between which a plot of 480 px has its axes
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -54,12 +56,29 @@ figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .flip:hover img+img{opacity:1}
 .book{max-width:720px}.book input{width:100%}
 .pair{display:flex;gap:1rem}.pair figure{flex:1}
-.bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
+td:has(.bar){width:22%}.bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
 .score{font-size:1.1rem;display:flex;gap:.8rem;align-items:center}
 .score div{width:12rem;background:var(--edge);border-radius:4px}.score div div{height:.9rem}
 .warn{border-left:4px solid #f59e0b;padding:.2rem .8rem;margin:.4rem 0}
 .dot{display:inline-block;width:.8em;height:.8em;border-radius:2px;margin:0 .3em 0 .8em}
 """.strip()
+PAGE = Template(
+    """
+<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>
+<title>3D-GIMP report</title><style>$style</style><h1>3D-GIMP: object removed</h1>
+<p>$facts</p>
+$verdict$warnings
+<h2>Before and after</h2><div class=grid>$pairs</div>
+$flips
+<h2>Stages</h2>$stages
+$charts$references
+<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. $legend</p>
+<div class=grid>$pictures</div>
+<h2>Counts</h2>$counts
+<details><summary>Settings</summary><pre>$settings</pre></details></html>
+""".lstrip()
+)
+TURN = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k != value)"  # of the flip-book's slider
 
 
 def write_removal_report(
@@ -68,27 +87,25 @@ def write_removal_report(
     """Write index.html and its pictures into `folder`; returns the page's path."""
     kept = scene.take(result.keep)
     after = kept if result.added is None else kept.extended(result.added)
-    chosen = [views[k * len(views) // 6] for k in range(min(6, len(views)))]
-    pairs = []
-    for k, view in enumerate(chosen):
+    parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": []}
+    for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
         names = (f"before_{k}.png", f"after_{k}.png")
-        write_png(folder / names[0], render_bytes(scene, view.camera))
-        write_png(folder / names[1], render_bytes(after, view.camera))
-        pairs.append((view.camera.id, *names))
+        for name, gaussians in zip(names, (scene, after)):
+            write_png(folder / name, render_bytes(gaussians, view.camera))
+        pair = f"<div class=flip><img src='{names[0]}' alt='before'><img src='{names[1]}' alt='after'></div>"
+        parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
-    flips = []
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
-        flips.append((camera_id, f"view_{k:02d}.png"))
-        write_png(folder / flips[-1][1], image)
+        write_png(folder / f"view_{k:02d}.png", image)
+        parts["flips"].append(_figure(_image(f"view_{k:02d}.png"), camera_id, " hidden" if k else ""))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
         write_png(folder / f"chart_{number}.png", draw(picture))
-    stage_pictures = []
     for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
-        name = f"stage_{k:02d}.png"
-        write_png(folder / name, draw(picture))
-        stage_pictures.append((picture.title, name, picture.kind in ("rules", "shadow", "refined")))
-    page = _page(summary, pairs, flips, stage_pictures, result.charts, result.references)
+        write_png(folder / f"stage_{k:02d}.png", draw(picture))
+        wide = " class=wide" if picture.kind in ("rules", "shadow", "refined") else ""
+        parts["pictures"].append(_figure(_image(f"stage_{k:02d}.png"), picture.title, wide))
+    page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
 
@@ -165,46 +182,62 @@ def relief(
     return outlined(shaded, mask)
 
 
+@dataclass(frozen=True)
+class FitAxes:
+    """Where a plot shows (prior, disparity): nearly all pairs fill it, outliers stay outside."""
+
+    first: np.ndarray  # [2] at its lower left corner
+    last: np.ndarray  # [2] at its upper right one
+
+    @classmethod
+    def around(cls, ring: np.ndarray) -> FitAxes:
+        ends = np.percentile(ring, [1, 99], axis=0)
+        middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
+        return cls(middle - half, middle + half)
+
+    def place(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [..., 2] of (prior, disparity)."""
+        share = (points - self.first) / (self.last - self.first)
+        return PLOT_LOW + (PLOT_HIGH - PLOT_LOW) * np.stack([share[..., 0], 1 - share[..., 1]], -1)
+
+    def line(self, line: np.ndarray) -> np.ndarray:
+        """Pixels [2, 2] of the ends of the line disparity = slope · prior + offset."""
+        return self.place(np.array([(m, line[0] * m + line[1]) for m in (self.first[0], self.last[0])]))
+
+
 def fit_plot(
     ring: np.ndarray,  # [N, 2] (prior, scene's disparity) of pixels round the hole
     line: np.ndarray,  # [2] (slope, offset) fitted to them
     scale: np.ndarray,  # s_f, one number: the slope as far as the prior is believed; 0 = it is not used
-    size: int = 480,  # px
 ) -> np.ndarray:
     """How s_f was measured: the scene's disparity over the prior, and the line fitted; [size, size, 3] uint8."""
     ink, faint, dots, drawn_line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
-    font, low, high = cv2.FONT_HERSHEY_SIMPLEX, 56, size - 56
-    drawn = np.full((size, size, 3), 255, np.uint8)
-    ends = np.percentile(ring, [1, 99], axis=0)  # outliers stay outside
-    middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
-    first, last = middle - half, middle + half
+    low, high, axes = PLOT_LOW, PLOT_HIGH, FitAxes.around(ring)
+    drawn = np.full((low + high, low + high, 3), 255, np.uint8)
 
-    def place(points: np.ndarray) -> np.ndarray:
-        """Pixels [..., 2] of (prior, disparity)."""
-        share = (points - first) / (last - first)
-        return np.stack([low + share[..., 0] * (high - low), high - share[..., 1] * (high - low)], -1)
+    def write(words: str, x: int, y: int, size: float = 0.38, colour: tuple[int, ...] = ink, width: int = 1) -> None:
+        cv2.putText(drawn, words, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
 
     for share in (0, 0.25, 0.5, 0.75, 1):
         at = round(low + share * (high - low))
-        value = first + share * (last - first)
+        value = axes.first + share * (axes.last - axes.first)
         cv2.line(drawn, (at, low), (at, high), faint, 1)
         cv2.line(drawn, (low, low + high - at), (high, low + high - at), faint, 1)
-        cv2.putText(drawn, f"{value[0]:.3g}", (at - 20, high + 20), font, 0.38, ink, 1, cv2.LINE_AA)
-        cv2.putText(drawn, f"{value[1]:.3g}", (6, low + high - at + 4), font, 0.38, ink, 1, cv2.LINE_AA)
-    inside = ((ring >= first) & (ring <= last)).all(1)
-    for x, y in np.rint(place(ring[inside])).astype(int):
+        write(f"{value[0]:.3g}", at - 20, high + 20)
+        write(f"{value[1]:.3g}", 6, low + high - at + 4)
+    inside = ((ring >= axes.first) & (ring <= axes.last)).all(1)
+    for x, y in np.rint(axes.place(ring[inside])).astype(int):
         cv2.circle(drawn, (int(x), int(y)), 1, dots, -1, cv2.LINE_AA)
-    fitted = place(np.array([(m, line[0] * m + line[1]) for m in (first[0], last[0])]))
+    fitted = axes.line(line)
     if np.abs(fitted).max() < 1e6:  # OpenCV's coordinates are short
         start, end = ((round(float(x)), round(float(y))) for x, y in fitted)
         seen, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), start, end)
         if seen:
             cv2.line(drawn, start, end, drawn_line, 2, cv2.LINE_AA)
     words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
-    words += f" (fitted {float(line[0]):.3g})"
-    cv2.putText(drawn, words, (low, 24), font, 0.55, drawn_line, 2, cv2.LINE_AA)
-    cv2.putText(drawn, "prior", (size // 2 - 16, size - 12), font, 0.45, ink, 1, cv2.LINE_AA)
-    cv2.putText(drawn, "disparity of the scene", (6, 46), font, 0.45, ink, 1, cv2.LINE_AA)
+    write(f"{words} (fitted {float(line[0]):.3g})", low, 24, 0.55, drawn_line, 2)
+    write("prior", (low + high) // 2 - 16, high + 44, 0.45)
+    write("disparity of the scene", 6, 46, 0.45)
     return drawn
 
 
@@ -220,128 +253,117 @@ def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.
     return np.where(there[..., None], colour, image // 2)
 
 
-def _page(
-    summary: dict[str, Any],
-    pairs: Sequence[tuple[str, str, str]],
-    flips: Sequence[tuple[str, str]],
-    pictures: Sequence[tuple[str, str, bool]],  # title, file, whether it takes a row of its own
-    charts: Sequence[Chart],
-    choices: Sequence[ReferenceChoice],
-) -> str:
-    counts, text = summary["counts"], html.escape
-    longest = max((s["seconds"] for s in summary["stages"]), default=1) or 1
-    rows = "".join(
-        f"<tr><td>{text(s['name'])}</td><td class=n>{s['seconds']:.2f} s</td>"
-        f"<td style='width:22%'><div class=bar style='width:{100 * s['seconds'] / longest:.0f}%'></div></td>"
-        f"<td class=n>{s['confidence']:.0%}</td><td>{text(s['reason'])}</td></tr>"
-        for s in summary["stages"]
+def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalResult) -> str:
+    counts, stages = summary["counts"], summary["stages"]
+    longest = max((s["seconds"] for s in stages), default=1) or 1
+    timed = (
+        (s["name"], f"{s['seconds']:.2f} s", _bar(s["seconds"] / longest), f"{s['confidence']:.0%}", s["reason"])
+        for s in stages
     )
-    before_after = "".join(
-        f"<figure><div class=flip><img src='{a}' alt='before'><img src='{b}' alt='after'></div>"
-        f"<figcaption>{text(name)} – hover to see it without the object</figcaption></figure>"
-        for name, a, b in pairs
+    dots = (
+        (f"<span class=dot style='background:rgb{colour}'></span>", words) for words, colour in RULE_COLOURS.values()
     )
-    stages = "".join(
-        f"<figure{' class=wide' if wide else ''}><img src='{name}' alt=''>"
-        f"<figcaption>{text(title)}</figcaption></figure>"
-        for title, name, wide in pictures
+    numbers = (counts | summary.get("selection", {})).items()
+    return PAGE.substitute(
+        style=STYLE,
+        facts=f"{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
+        f"peak memory {summary['peak_memory_mb']:.0f} MB, version {escape(summary['version'])}.",
+        verdict=_verdict(summary.get("verdict")),
+        warnings="".join(f"<p class=warn>{escape(w)}</p>" for w in summary["warnings"]),
+        pairs="".join(parts["pairs"]),
+        flips=_flip_book(parts["flips"]),
+        stages=_table(_rows(".n.n.", timed), "<tr><th>stage<th>time<th><th>confidence<th>what happened</tr>"),
+        charts=_charts(result.charts, summary),
+        references=_references(result.references),
+        legend="".join(dot + escape(words) for dot, words in dots),
+        pictures="".join(parts["pictures"]),
+        counts=_table(_rows(".n", ((k.replace("_", " "), f"{v:,}") for k, v in numbers))),
+        settings=escape(json.dumps(summary["settings"], indent=1)),
     )
-    legend = "".join(
-        f"<span class=dot style='background:rgb{colour}'></span>{text(words)}"
-        for words, colour in RULE_COLOURS.values()
-    )
-    warnings = "".join(f"<p class=warn>{text(w)}</p>" for w in summary["warnings"])
-    settings = text(json.dumps(summary["settings"], indent=1))
-    numbers = "".join(
-        f"<tr><td>{text(k.replace('_', ' '))}</td><td class=n>{v:,}</td></tr>"
-        for k, v in (counts | summary.get("selection", {})).items()
-    )
-    return (
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>3D-GIMP report</title><style>{STYLE}</style><h1>3D-GIMP: object removed</h1>"
-        f"<p>{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
-        f"peak memory {summary['peak_memory_mb']:.0f} MB, version {text(summary['version'])}.</p>"
-        f"{_verdict(summary.get('verdict'))}{warnings}"
-        f"<h2>Before and after</h2><div class=grid>{before_after}</div>"
-        f"{_flip_book(flips)}"
-        f"<h2>Stages</h2><table><tr><th>stage<th>time<th><th>confidence<th>what happened</tr>{rows}</table>"
-        f"{_charts(charts, summary)}{_references(choices)}"
-        f"<h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. {legend}</p>"
-        f"<div class=grid>{stages}</div>"
-        f"<h2>Counts</h2><table>{numbers}</table>"
-        f"<details><summary>Settings</summary><pre>{settings}</pre></details></html>\n"
-    )
+
+
+class _Html(str):
+    """Text that is HTML already."""
+
+
+def _rows(kinds: str, rows: Iterable[Sequence[str]]) -> str:
+    """Table rows; the kind of a column is n for numbers, else a dot."""
+    cells = {"n": "<td class=n>", ".": "<td>"}
+    texts = ([cell if isinstance(cell, _Html) else escape(cell) for cell in row] for row in rows)
+    return "".join(f"<tr>{''.join(f'{cells[k]}{t}</td>' for k, t in zip(kinds, row))}</tr>" for row in texts)
+
+
+def _table(rows: str, head: str = "") -> str:
+    return f"<table>{head}{rows}</table>"
+
+
+def _bar(share: float) -> _Html:
+    return _Html(f"<div class=bar style='width:{share:.0%}'></div>")
+
+
+def _figure(content: str, caption: str, attributes: str = "") -> str:
+    return f"<figure{attributes}>{content}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _image(name: str, words: str = "") -> str:
+    return f"<img src='{name}' alt='{words}'>"
 
 
 def _verdict(verdict: dict[str, Any] | None) -> str:
     """The score as a bar from red to green, what it comes to, and its figures."""
     if verdict is None:
         return ""
-    score, words = verdict["score"], [html.escape(w) for w in verdict["words"]]
+    score, words = verdict["score"], [escape(w) for w in verdict["words"]]
     bar = f"<div><div style='width:{score:.0%};background:hsl({120 * score:.0f} 60% 45%)'></div></div>"
-    advice = "".join(f"<li>{w}</li>" for w in words[1:])
-    figures = "".join(
-        f"<tr><td>{name.replace('_', ' ')}</td><td class=n>{verdict[name]:.3f}</td><td>{meaning}</td></tr>"
-        for name, meaning in MEANINGS.items()
-        if verdict[name] is not None
-    )
+    figures = ((n.replace("_", " "), f"{verdict[n]:.3f}", m) for n, m in MEANINGS.items() if verdict[n] is not None)
     return (
-        f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{advice}</ul>"
-        f"<details><summary>What the score is made of</summary><table>{figures}</table></details>"
+        f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{''.join(f'<li>{w}</li>' for w in words[1:])}</ul>"
+        f"<details><summary>What the score is made of</summary>{_table(_rows('.n.', figures))}</details>"
     )
 
 
-def _flip_book(flips: Sequence[tuple[str, str]]) -> str:
+def _flip_book(figures: Sequence[str]) -> str:
     """The painted views one after the other, under a slider."""
-    if not flips:
+    if not figures:
         return ""
-    figures = "".join(
-        f"<figure{' hidden' if k else ''}><img src='{picture}' alt=''>"
-        f"<figcaption>{html.escape(name)}</figcaption></figure>"
-        for k, (name, picture) in enumerate(flips)
-    )
-    turn = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k != value)"
-    slider = f"<input type=range min=0 max={len(flips) - 1} value=0 aria-label=view oninput='{turn}'>"
-    return f"<h2>Painted views</h2><div class=book>{slider}<div>{figures}</div></div>"
+    slider = f"<input type=range min=0 max={len(figures) - 1} value=0 aria-label=view oninput='{TURN}'>"
+    return f"<h2>Painted views</h2><div class=book>{slider}<div>{''.join(figures)}</div></div>"
 
 
 def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
     """The hidden surfaces straight on: what photos show of each, and its completed picture."""
     if not charts:
         return ""
-    rows = "".join(
-        f"<tr><td>chart:{k}</td><td>{facts['kind']}</td><td class=n>{facts['texels']:,}</td>"
-        f"<td class=n>{facts['hole_texels']:,}</td><td class=n>{facts['photos_median']:.0f}</td>"
-        f"<td>{html.escape(chart.reason)}</td></tr>"
-        f"<tr><td colspan=6><div class=pair><figure><img src='chart_{k}.png' alt='hole'>"
-        "<figcaption>What photos show; red: the hole</figcaption></figure>"
-        f"<figure><img src='charts/{k}.png' alt='completed'><figcaption>Completed</figcaption></figure></div>"
-        "</td></tr>"
-        for k, (chart, facts) in enumerate(zip(charts, summary["charts"]), 1)
-    )
+    rows = ""
+    for k, (chart, facts) in enumerate(zip(charts, summary["charts"]), 1):
+        figures = _figure(_image(f"chart_{k}.png", "hole"), "What photos show; red: the hole")
+        figures += _figure(_image(f"charts/{k}.png", "completed"), "Completed")
+        numbers = (f"{facts['texels']:,}", f"{facts['hole_texels']:,}", f"{facts['photos_median']:.0f}")
+        rows += _rows("..nnn.", [(f"chart:{k}", facts["kind"], *numbers, chart.reason)])
+        rows += f"<tr><td colspan=6><div class=pair>{figures}</div></td></tr>"
     return (
         "<h2>Charts</h2><p>The surfaces behind the object, straight on. To paint one: <code>--reference chart:N "
-        "--reference-image FILE</code>.</p><table><tr><th>chart<th>kind<th>texels<th>hole<th>photos of a texel"
-        f"<th>why</tr>{rows}</table>"
+        "--reference-image FILE</code>.</p>"
+        + _table(rows, "<tr><th>chart<th>kind<th>texels<th>hole<th>photos of a texel<th>why</tr>")
     )
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:
     """Why each reference was chosen: the best views' scores as a table."""
-    tables = []
+    tables = ""
     for choice in choices:
-        rows = "".join(
-            f"<tr><td>{'<b>' if s.camera_id == choice.camera_id else ''}{html.escape(s.camera_id)}</td>"
-            f"<td class=n>{s.score:.2f}</td>"
-            f"<td style='width:22%'><div class=bar style='width:{100 * s.score:.0f}%'></div></td>"
-            f"<td class=n>{s.covered:.0%}</td><td class=n>{s.facing:.2f}</td><td class=n>{s.detail:.0%}</td></tr>"
-            for k, s in enumerate(choice.scores)
-            if k < MOST_SCORES or s.camera_id == choice.camera_id
+        shown = [s for k, s in enumerate(choice.scores) if k < MOST_SCORES or s.camera_id == choice.camera_id]
+        names = (
+            _Html(f"<b>{escape(s.camera_id)}</b>") if s.camera_id == choice.camera_id else s.camera_id for s in shown
         )
-        plan = ", ".join(f"{html.escape(name)} ({share:.0%})" for name, share in choice.plan)
-        tables.append(
-            "<table><tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
-            f"{rows}</table><p>{len(choice.scores)} candidates. Covered by the chosen view, then by the next best: "
-            f"{plan}</p>"
+        rows = (
+            (name, f"{s.score:.2f}", _bar(s.score), f"{s.covered:.0%}", f"{s.facing:.2f}", f"{s.detail:.0%}")
+            for name, s in zip(names, shown)
         )
-    return f"<h2>Reference views</h2>{''.join(tables)}" if tables else ""
+        head = "<tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
+        plan = ", ".join(f"{escape(name)} ({share:.0%})" for name, share in choice.plan)
+        tables += (
+            f"{_table(_rows('.n.nnn', rows), head)}<p>{len(choice.scores)} candidates. Covered by the chosen view, "
+            f"then by the next best: {plan}</p>"
+        )
+    return f"<h2>Reference views</h2>{tables}" if tables else ""

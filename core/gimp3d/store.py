@@ -47,9 +47,7 @@ class StageStore:
             if document["checksum"] != _checksum(document["result"], arrays):
                 return None
             return self._decode(document["result"], arrays)
-        except (
-            Exception
-        ):  # empty, damaged, somebody else's, of an older version: whatever is wrong, the stage runs again
+        except Exception:  # empty, damaged, somebody else's, of an older version: whatever it is, the stage runs again
             return None
 
     def save(self, name: str, result: Any) -> None:

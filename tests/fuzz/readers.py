@@ -26,7 +26,6 @@ from test_formats import WRITERS, sog_files, some
 
 from gimp3d.box import Box, read_region
 from gimp3d.camera import Camera
-from gimp3d.commands import job_settings
 from gimp3d.errors import Gimp3dError
 from gimp3d.io.cameras import camera_id, read_cameras
 from gimp3d.io.formats import _from_sog, read_scene
@@ -34,6 +33,7 @@ from gimp3d.io.images import load_view, read_image
 from gimp3d.io.ply import _parse_header, write_gaussians
 from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d.schema import checked, parse_json
+from gimp3d.settings import job_settings
 from gimp3d.store import StageStore
 
 EXPECTED = (Gimp3dError, MemoryError)  # MemoryError: refused before it was taken, see gimp3d.memory

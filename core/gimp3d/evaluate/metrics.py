@@ -1,4 +1,4 @@
-"""PSNR, SSIM and FLIP against true pictures, averaged inside a mask (CONTRACT: evaluate)."""
+"""PSNR, SSIM and FLIP against true pictures, averaged inside a mask."""
 
 from __future__ import annotations
 

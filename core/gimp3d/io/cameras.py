@@ -5,12 +5,11 @@ Everything behind it is OpenCV: x right, y down, z forward, world→camera, pixe
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from ..camera import Camera, Distortion, output_name
 from ..errors import BadInput
-from ..files import require_file, write_atomically
+from ..files import require_file, write_json
 from ..gaussians import quats_to_matrices
 from ..schema import Between, checked, read_json, shown
 
@@ -29,49 +28,34 @@ LONGEST_NAME = 200  # bytes of each part of an ID: file systems allow 255, and o
 LONGEST_ID = 1000
 LensAngle = Annotated[float, Between(1e-4, math.pi - 1e-4)]  # radians
 EXACT = "world_to_camera"  # our own key of a frame; counts only where transform_matrix says the same
-REFUSED = {
-    "fisheye": {
-        "OPENCV_FISHEYE",
-        "SIMPLE_RADIAL_FISHEYE",
-        "RADIAL_FISHEYE",
-        "THIN_PRISM_FISHEYE",
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        "FOV",
-        "FISHEYE",
-    },
-    "panoramic": {
-        "EQUIRECTANGULAR",
-        "SPHERICAL",
-        "VR180_L",
-        "VR180_R",
-        "OMNIDIRECTIONALSTEREO_L",
-        "OMNIDIRECTIONALSTEREO_R",
-        "PANORAMIC",
-    },
-    "orthographic": {"ORTHOGRAPHIC", "ORTHOPHOTO"},
+REFUSED = {  # camera models that have no pinhole picture
+    "fisheye": ".*FISHEYE|FOV",
+    "panoramic": "EQUIRECTANGULAR|SPHERICAL|PANORAMIC|(VR180|OMNIDIRECTIONALSTEREO)_[LR]",
+    "orthographic": "ORTHOGRAPHIC|ORTHOPHOTO",
 }
 PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-COLMAP_MODELS = (  # by their numbers in cameras.bin
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-)
-COLMAP_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
+COLMAP_MODELS = {  # in the order of their numbers in cameras.bin; the parameters of each, ? where they are not read
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "? ? ? ? ? ? ? ?",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "? ? ? ? ?",
+    "SIMPLE_RADIAL_FISHEYE": "? ? ? ?",
+    "RADIAL_FISHEYE": "? ? ? ? ?",
+    "THIN_PRISM_FISHEYE": "? ? ? ? ? ? ? ? ? ? ? ?",
+}
+Lens = tuple[str, int, int, list[float]]  # COLMAP's model, width, height, parameters
+Pose = tuple[str, int, list[float], list[float]]  # name, number of the lens, quaternion wxyz, translation
 
 
 def read_cameras(
     path: Path | str,
     images: Path | None = None,  # folder of the photos; default: beside the camera file
 ) -> tuple[Camera, ...]:
-    """Read cameras of any known kind, told apart by content (CONTRACT: CAMS).
+    """Read cameras of any known kind, told apart by content.
 
     Raises
     ------
@@ -108,28 +92,12 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
     """
     frames = []
     for c in cameras:
-        d = c.distortion or Distortion()
-        frames.append(
-            {
-                "file_path": c.id,
-                "split": c.split,
-                "w": c.width,
-                "h": c.height,
-                "fl_x": c.fx,
-                "fl_y": c.fy,
-                "cx": c.cx,
-                "cy": c.cy,
-                "k1": d.k1,
-                "k2": d.k2,
-                "p1": d.p1,
-                "p2": d.p2,
-                "k3": d.k3,
-                "transform_matrix": (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist(),
-                EXACT: c.viewmat.tolist(),
-            }
-        )
+        lens = {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy}
+        pose = (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist()
+        frame = {"file_path": c.id, "split": c.split, **lens, **asdict(c.distortion or Distortion())}
+        frames.append({**frame, "transform_matrix": pose, EXACT: c.viewmat.tolist()})
     document = {"camera_model": "OPENCV", "frames": frames}
-    write_atomically(Path(path), lambda f: f.write(json.dumps(document, indent=1).encode()))
+    write_json(Path(path), document)
 
 
 def camera_id(name: Any, where: str) -> str:
@@ -158,10 +126,7 @@ def rigid(
     BadInput
         If it is not a finite 4×4 matrix, or it mirrors, shears or flattens.
     """
-    try:
-        m = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError, RecursionError):
-        m = np.zeros(0)
+    m = _numbers(matrix)
     if m.shape == (3, 4):
         m = np.vstack([m, [0, 0, 0, 1]])
     if m.shape != (4, 4) or not np.isfinite(m).all():
@@ -175,6 +140,14 @@ def rigid(
     if np.linalg.det(m[:3, :3]) < 0:
         raise BadInput(f"{where}: the pose mirrors the scene")
     return np.block([[_nearest_rotation(m[:3, :3]), m[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """A value from a file as float64; without elements if it is no array of numbers."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        return np.zeros(0)
 
 
 def _nearest_rotation(linear: np.ndarray) -> np.ndarray:
@@ -237,7 +210,7 @@ def make_camera(
 def refuse_model(model: str, where: str) -> None:
     """Raise BadInput if a camera model is one of those that have no pinhole picture."""
     for kind, names in REFUSED.items():
-        if model.upper() in names:
+        if re.fullmatch(names, model, re.IGNORECASE):
             raise BadInput(f"{where}: {kind} cameras ({model}) are not supported; undistort the photos to a pinhole")
 
 
@@ -294,10 +267,7 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
 
 def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
     """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
-    try:
-        exact = np.array(told, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError, RecursionError):
-        return viewmat
+    exact = _numbers(told)
     same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
     return exact if same else viewmat
 
@@ -309,9 +279,7 @@ def _transforms_intrinsics(
     if width is None or height is None:
         width, height = _image_size(photo, where)
     if fx is None and frame.camera_angle_x is not None:
-        angle = checked(
-            Annotated[float, Between(1e-4, math.pi - 1e-4)], frame.camera_angle_x, f"{where}: camera_angle_x"
-        )
+        angle = checked(LensAngle, frame.camera_angle_x, f"{where}: camera_angle_x")
         fx = 0.5 * width / math.tan(0.5 * angle)
     if fx is None:
         raise BadInput(f"{where}: no focal length (fl_x or camera_angle_x)")
@@ -340,13 +308,6 @@ def _photo(folder: Path, name: str) -> Path:
     return next((c for c in candidates if c.exists()), candidates[0])
 
 
-def _distortion(coefficients: Sequence[Any], where: str) -> Distortion:
-    try:
-        return Distortion(*(float(c) for c in coefficients))
-    except (TypeError, ValueError):
-        raise BadInput(f"{where}: the distortion coefficients are not numbers") from None
-
-
 @dataclass(frozen=True)
 class _Entry:
     """A camera of Inria's cameras.json."""
@@ -365,11 +326,10 @@ def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[C
     for k, given in enumerate(document):
         where = f"{path}, camera {k}"
         entry: _Entry = checked(_Entry, given, where, extra=True)
-        try:
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = np.array(entry.rotation, float), np.array(entry.position, float)
-        except (TypeError, ValueError, OverflowError, RecursionError):
-            raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers") from None
+        rotation, position, pose = _numbers(entry.rotation), _numbers(entry.position), np.eye(4)
+        if rotation.shape != (3, 3) or position.shape != (3,):
+            raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers")
+        pose[:3, :3], pose[:3, 3] = rotation, position
         name = camera_id(entry.img_name, where)
         viewmat = _inverted(rigid(pose, where))
         intrinsics = (entry.fx, entry.fy, entry.width / 2, entry.height / 2)
@@ -419,39 +379,30 @@ def _is_model(folder: Path) -> bool:
 
 
 def _colmap_intrinsics(
-    kind: str, p: Sequence[float], where: str
+    kind: str, parameters: Sequence[float], where: str
 ) -> tuple[tuple[float, float, float, float], Distortion | None]:
-    layouts: dict[str, Callable[[], tuple[tuple[float, float, float, float], list[float]]]] = {
-        "SIMPLE_PINHOLE": lambda: ((p[0], p[0], p[1], p[2]), []),
-        "PINHOLE": lambda: ((p[0], p[1], p[2], p[3]), []),
-        "SIMPLE_RADIAL": lambda: ((p[0], p[0], p[1], p[2]), [p[3]]),
-        "RADIAL": lambda: ((p[0], p[0], p[1], p[2]), [p[3], p[4]]),
-        "OPENCV": lambda: ((p[0], p[1], p[2], p[3]), list(p[4:8])),
-        "FULL_OPENCV": lambda: ((p[0], p[1], p[2], p[3]), list(p[4:9])),
-    }
-    if kind not in layouts or (kind == "FULL_OPENCV" and any(p[9:12])):
+    names = COLMAP_MODELS.get(kind, "?").split()
+    p = dict(zip(names, parameters))
+    if "?" in names or any(p.get(k) for k in ("k4", "k5", "k6")):
         raise BadInput(f"{where}: the camera model {kind} is not supported; undistort the photos to a pinhole")
-    try:
-        intrinsics, coefficients = layouts[kind]()
-    except IndexError:
-        raise BadInput(f"{where}: the camera model {kind} has too few parameters") from None
-    return intrinsics, _distortion(coefficients, where) if coefficients else None
+    if not set(names) - {"k4", "k5", "k6"} <= set(p):
+        raise BadInput(f"{where}: the camera model {kind} has too few parameters")
+    fx, fy = (p["f"], p["f"]) if "f" in p else (p["fx"], p["fy"])
+    coefficients = {k: v for k, v in p.items() if k in ("k1", "k2", "p1", "p2", "k3")}
+    return (fx, fy, p["cx"], p["cy"]), Distortion(**coefficients) if coefficients else None
 
 
 def _data_lines(path: Path) -> list[str]:
-    return [
-        line.rstrip("\r")
-        for line in require_file(path).read_text(encoding="utf-8").split("\n")
-        if not line.startswith("#")
-    ]
+    lines = require_file(path).read_text(encoding="utf-8").split("\n")
+    return [line.rstrip("\r") for line in lines if not line.startswith("#")]
 
 
-def _colmap_cameras_txt(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
+def _colmap_cameras_txt(model: Path) -> dict[int, Lens]:
     rows = [line.split() for line in _data_lines(model / "cameras.txt") if line.strip()]
     return {int(r[0]): (r[1], int(r[2]), int(r[3]), [float(v) for v in r[4:]]) for r in rows}
 
 
-def _colmap_images_txt(model: Path) -> list[tuple[str, int, list[float], list[float]]]:
+def _colmap_images_txt(model: Path) -> list[Pose]:
     poses = []
     lines = iter(_data_lines(model / "images.txt"))
     for line in lines:
@@ -463,20 +414,21 @@ def _colmap_images_txt(model: Path) -> list[tuple[str, int, list[float], list[fl
     return poses
 
 
-def _colmap_cameras_bin(model: Path) -> dict[int, tuple[str, int, int, list[float]]]:
-    data = require_file(model / "cameras.bin").read_bytes()
+def _colmap_cameras_bin(folder: Path) -> dict[int, Lens]:
+    data = require_file(folder / "cameras.bin").read_bytes()
     (count,), at, found = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):
         number, kind, width, height = struct.unpack_from("<iiQQ", data, at)
         if not 0 <= kind < len(COLMAP_MODELS):
             raise ValueError(f"unknown camera model {kind}")
-        parameters = struct.unpack_from(f"<{COLMAP_PARAMETERS[kind]}d", data, at + 24)
-        at += 24 + 8 * COLMAP_PARAMETERS[kind]
-        found[number] = (COLMAP_MODELS[kind], width, height, list(parameters))
+        model, names = list(COLMAP_MODELS.items())[kind]
+        parameters = struct.unpack_from(f"<{len(names.split())}d", data, at + 24)
+        at += 24 + 8 * len(parameters)
+        found[number] = (model, width, height, list(parameters))
     return found
 
 
-def _colmap_images_bin(model: Path) -> list[tuple[str, int, list[float], list[float]]]:
+def _colmap_images_bin(model: Path) -> list[Pose]:
     data = require_file(model / "images.bin").read_bytes()
     (count,), at, poses = struct.unpack_from("<Q", data), 8, []
     for _ in range(count):

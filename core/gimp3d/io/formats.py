@@ -11,7 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -47,7 +47,8 @@ def read_scene(path: Path | str) -> SplatFile:
     path = Path(path)
     try:
         if path.is_dir() or path.name == "meta.json":
-            return file_of(_from_sog(_folder_reader(path if path.is_dir() else path.parent), path))
+            folder = path if path.is_dir() else path.parent
+            return file_of(_from_sog(_limited(lambda name: require_file(folder / Path(name).name).open("rb")), path))
         with require_file(path).open("rb") as f:
             start = f.read(4)
         if start[:3] == b"ply":
@@ -56,7 +57,7 @@ def read_scene(path: Path | str) -> SplatFile:
             return file_of(_from_spz(path))
         if start == b"PK\x03\x04":
             with zipfile.ZipFile(path) as archive:
-                return file_of(_from_sog(_archive_reader(archive), path))
+                return file_of(_from_sog(_limited(archive.open), path))
         if path.suffix.lower() == ".splat":
             return file_of(_from_splat(path))
     except OSError as error:
@@ -111,9 +112,8 @@ def _from_compressed_ply(path: Path) -> Gaussians:
             return low + unit * (high - low)
 
         means = between(_unpack(vertex["packed_position"], (21, 11, 0), (11, 10, 11)), ("x", "y", "z"))
-        log_scales = between(
-            _unpack(vertex["packed_scale"], (21, 11, 0), (11, 10, 11)), ("scale_x", "scale_y", "scale_z")
-        )
+        sizes = _unpack(vertex["packed_scale"], (21, 11, 0), (11, 10, 11))
+        log_scales = between(sizes, ("scale_x", "scale_y", "scale_z"))
         rgba = _unpack(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
         rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
         packed = vertex["packed_rotation"]
@@ -226,17 +226,9 @@ def _spz_quats(packed: np.ndarray) -> np.ndarray:
 Read = Callable[[str, int], bytes]  # a file of a scene by its name, and no more than so many bytes of it
 
 
-def _folder_reader(folder: Path) -> Read:
+def _limited(opened: Callable[[str], IO[bytes]]) -> Read:
     def read(name: str, most: int) -> bytes:
-        with require_file(folder / Path(name).name).open("rb") as file:
-            return file.read(most)
-
-    return read
-
-
-def _archive_reader(archive: zipfile.ZipFile) -> Read:
-    def read(name: str, most: int) -> bytes:
-        with archive.open(name) as file:
+        with opened(name) as file:
             return file.read(most)
 
     return read

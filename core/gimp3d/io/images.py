@@ -25,9 +25,7 @@ def read_image(path: Path | str) -> np.ndarray:
         If it is missing or not a picture.
     """
     try:
-        data = np.fromfile(
-            require_file(Path(path)), dtype=np.uint8
-        )  # not cv2.imread: it fails on non-ASCII names on Windows
+        data = np.fromfile(require_file(Path(path)), np.uint8)  # cv2.imread fails on non-ASCII names on Windows
     except OSError as error:
         raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
     return decode_image(data, str(path))
@@ -92,24 +90,16 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
         raise BadInput(f"camera {camera.id} has no photo")
     photo = read_image(camera.image)
     height, width = photo.shape[:2]
-    factor = width / camera.width
+    factor, has = width / camera.width, f"{camera.image} has {width}×{height} pixels"
     if factor < SMALLEST:
-        raise BadInput(
-            f"{camera.image} has {width}×{height} pixels, far fewer than its camera's {camera.width}×{camera.height}"
-        )
+        raise BadInput(f"{has}, far fewer than its camera's {camera.width}×{camera.height}")
     if abs(height - factor * camera.height) > max(ASPECT_TOLERANCE, ASPECT_TOLERANCE * factor):
-        raise BadInput(
-            f"{camera.image} has {width}×{height} pixels, which are not its camera's {camera.width}×{camera.height}"
-        )
+        raise BadInput(f"{has}, which are not its camera's {camera.width}×{camera.height}")
     if (width, height) != (camera.width, camera.height):
         way = cv2.INTER_AREA if factor > 1 else cv2.INTER_LINEAR
         photo = cv2.resize(photo, (camera.width, camera.height), interpolation=way)
     if camera.distortion is not None:
-        at_integers = camera.K - [
-            [0, 0, 0.5],
-            [0, 0, 0.5],
-            [0, 0, 0],
-        ]  # OpenCV's pixel centres are whole numbers
+        at_integers = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's pixel centres are whole numbers
         photo = cv2.undistort(photo, at_integers, camera.distortion.coefficients)
     return photo, undistorted(camera)
 

@@ -32,6 +32,11 @@ class Call:
         self.progress(self.stage, 0, 1, words)
 
 
+def one_line(text: object, most: int = 300) -> str:
+    """What somebody outside says, for an error's line."""
+    return " ".join(str(text).split())[:most]
+
+
 def waited(
     who: str,
     work: Callable[[], R],

@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import BadInput
 from ..io.images import read_image, write_png
 from .appearance import Painter
-from .calls import Call, waited
+from .calls import Call, one_line, waited
 
 GRACE = 0.3  # s that a program gets to end itself; Blender's Cancel ends this one after 0.8 s
 LINE = 4096  # characters of a line that are read at once
@@ -33,16 +33,29 @@ def painter(command: str, call: Call) -> Painter:
     words = split(command, call.option, ("{image}", "{mask}", "{out}"), ("{out}",))
 
     def paint(image: np.ndarray, mask: np.ndarray, seed: int, call: Call) -> np.ndarray:
-        with tempfile.TemporaryDirectory(prefix="gimp3d-", ignore_cleanup_errors=True) as folder:
-            paths = {name: Path(folder) / f"{name}.png" for name in ("image", "mask", "out")}
-            write_png(paths["image"], image)
-            write_png(paths["mask"], mask)
-            run(words, {f"{{{name}}}": path for name, path in paths.items()}, call)
-            if not paths["out"].exists():
-                raise BadInput(f"{call.option} command: {words[0]} wrote no {{out}} picture")
-            return read_image(paths["out"])
+        return asked(words, {"image": image, "mask": mask}, ("out.png",), call, read_image)
 
     return Painter(words[0], paint, f"the picture that {words[0]} wrote", whole=True)
+
+
+def asked(
+    words: Sequence[str],
+    given: Mapping[str, np.ndarray],  # the picture that {name} stands for
+    answers: Sequence[str],  # names of the files that it may write, each {name} without the ending; the first counts
+    call: Call,
+    read: Callable[[Path], np.ndarray],
+) -> np.ndarray:
+    """What a program makes of pictures; raises as `run` and `read` do."""
+    with tempfile.TemporaryDirectory(prefix="gimp3d-", ignore_cleanup_errors=True) as folder:
+        paths = {f"{{{Path(name).stem}}}": Path(folder) / name for name in (*(f"{n}.png" for n in given), *answers)}
+        for name, picture in given.items():
+            write_png(paths[f"{{{name}}}"], picture)
+        run(words, paths, call)
+        for name in answers:
+            if (Path(folder) / name).exists():
+                return read(Path(folder) / name)
+    wanted = " nor ".join(f"{{{Path(name).stem}}}" for name in reversed(answers))
+    raise BadInput(f"{call.option} command: {words[0]} wrote {'no' if len(answers) == 1 else 'neither'} {wanted}")
 
 
 def split(command: str, option: str, names: Sequence[str], needed: Sequence[str]) -> list[str]:
@@ -80,15 +93,14 @@ def run(words: Sequence[str], paths: dict[str, Path], call: Call) -> None:
             errors="replace",
             start_new_session=os.name == "posix",  # so that its own children can be ended with it
         )
-    except OSError as error:
-        raise BadInput(f"{call.option} command: cannot start {who} ({error.strerror})") from None
-    except ValueError as error:  # a zero byte
-        raise BadInput(f"{call.option} command: cannot start {who} ({error})") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte
+        reason = getattr(error, "strerror", None) or error
+        raise BadInput(f"{call.option} command: cannot start {who} ({reason})") from None
 
     def listen() -> int:
         assert process.stdout is not None
         for line in iter(lambda: process.stdout.readline(LINE), ""):  # type: ignore[union-attr]
-            said[0] = " ".join(line.split())[:200] or said[0]
+            said[0] = one_line(line, 200) or said[0]
         return process.wait()
 
     code = waited(who, listen, call, lambda: f"says: {said[0]}" if said[0] else "works", lambda: _end(process))

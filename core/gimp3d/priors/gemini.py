@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import BadInput
 from ..io.images import decode_image, encode_png
 from .appearance import Painter
-from .calls import Call, waited
+from .calls import Call, one_line, waited
 from .pasting import scaled
 
 MODEL = "gemini-2.5-flash-image"  # Nano Banana
@@ -129,9 +129,9 @@ def _asked(who: str, model: str, key: str, pictures: list[bytes], aspect: str, s
         client = genai.Client(vertexai=False, api_key=key, http_options=options)
         answer = client.models.generate_content(model=model, contents=[*contents, words], config=config)
     except errors.APIError as error:
-        raise BadInput(f"{who}: Google refused ({error.code} {error.status}): {_line(error.message)}") from None
+        raise BadInput(f"{who}: Google refused ({error.code} {error.status}): {one_line(error.message)}") from None
     except Exception as error:  # of whatever library the client has for its connections
-        raise BadInput(f"{who}: cannot reach Google ({_line(error) or type(error).__name__})") from None
+        raise BadInput(f"{who}: cannot reach Google ({one_line(error) or type(error).__name__})") from None
     said = []
     for candidate in answer.candidates or []:
         for part in (candidate.content.parts if candidate.content else None) or []:
@@ -141,9 +141,5 @@ def _asked(who: str, model: str, key: str, pictures: list[bytes], aspect: str, s
         said.append(str(candidate.finish_reason.value) if candidate.finish_reason else "")
     if answer.prompt_feedback is not None and answer.prompt_feedback.block_reason is not None:
         said.append(f"blocked: {answer.prompt_feedback.block_reason.value}")
-    why = _line("; ".join(filter(None, said))) or "no reason given"
+    why = one_line("; ".join(filter(None, said))) or "no reason given"
     raise BadInput(f"{who}: {model} answers without a picture ({why})")
-
-
-def _line(text: Any) -> str:
-    return " ".join(str(text).split())[:300]

@@ -1,4 +1,4 @@
-"""Who invents the reference without the object: the table of providers (METHOD section 2, docs/painters.md).
+"""Who invents the reference without the object: the table of providers (docs/painters.md).
 
 A provider of this program is a function Unfinished → Appearance, named in `builtin.PROVIDERS`. Whoever paints outside
 it is a `Painter`, made by what `PAINTERS` names for its argument after the colon; its pictures are registered and
@@ -46,7 +46,7 @@ def inpaint_reference(
     unknown: np.ndarray | None = None,  # [H, W] bool, see Unfinished
     call: Call = Call(),
 ) -> Appearance:
-    """Fill the hole by the provider that `spec` names (CONTRACT: Providers).
+    """Fill the hole by the provider that `spec` names.
 
     The surface guides `exemplar`: textures are copied along it, so that they shrink with distance.
 

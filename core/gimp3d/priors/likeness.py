@@ -1,4 +1,4 @@
-"""Whether a picture shows a view, and how it is brought to the view's place and exposure (METHOD section 2)."""
+"""Whether a picture shows a view, and how it is brought to the view's place and exposure."""
 
 from __future__ import annotations
 

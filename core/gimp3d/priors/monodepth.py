@@ -1,4 +1,4 @@
-"""Relative depth of the reference from elsewhere: the paper's monocular model, or a file (METHOD section 3).
+"""Relative depth of the reference from elsewhere: the paper's monocular model, or a file (docs/method.md).
 
 A prior says what its numbers are, since models differ: `disparity` (near is large, any scale and shift: MiDaS, Depth
 Anything), `depth` (far is large, any scale and shift: Marigold and other affine-invariant depth) or `metric` (z-depth
@@ -7,7 +7,6 @@ up to scale). `relative_disparity` brings all of them to disparity of any scale 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
-from ..io.images import write_png
 from ..solvers.robust import robust_fit
 from . import command, torchscript
 from .calls import Call, waited
@@ -163,10 +161,8 @@ def _from_file(path: Path, height: int, width: int) -> np.ndarray:
     if values.ndim != 2 or values.size == 0:
         raise BadInput(f"--depth-prior: {path} is not a depth picture of one channel")
     if abs(values.shape[1] * height - values.shape[0] * width) > 1.5 * max(values.shape[0], height):
-        raise BadInput(
-            f"--depth-prior: {path} has {values.shape[1]}×{values.shape[0]} pixels, not the shape of the view "
-            f"({width}×{height})"
-        )
+        size = f"{values.shape[1]}×{values.shape[0]}"
+        raise BadInput(f"--depth-prior: {path} has {size} pixels, not the shape of the view ({width}×{height})")
     return values
 
 
@@ -175,17 +171,8 @@ def _by_command(text: str, call: Call) -> Look:
 
     def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
         assert image is not None
-        with tempfile.TemporaryDirectory(prefix="gimp3d-", ignore_cleanup_errors=True) as folder:
-            paths = {
-                f"{{{n}}}": Path(folder) / f
-                for n, f in (("image", "image.png"), ("out", "out.png"), ("npy", "out.npy"))
-            }
-            write_png(paths["{image}"], image)
-            command.run(words, paths, call)
-            found = next((paths[name] for name in ("{npy}", "{out}") if paths[name].exists()), None)
-            if found is None:
-                raise BadInput(f"{call.option} command: {words[0]} wrote neither {{out}} nor {{npy}}")
-            return _from_file(found, height, width)
+        found = ("npy.npy", "out.png")
+        return command.asked(words, {"image": image}, found, call, lambda path: _from_file(path, height, width))
 
     return look
 

@@ -6,9 +6,11 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..errors import BadInput
+from .pasting import scaled
 
 BRIGHTEST = 2.0  # answers up to here are in [0, 1], give or take what networks overshoot
 LONGEST = 8192  # px of a side that a model may declare or be asked for: more is a damaged file or a slip
@@ -36,6 +38,17 @@ def check_size(size: tuple[int, int], what: str) -> None:
     """Raise BadInput if (width, height) is no size for a picture; `what` says whose it is."""
     if not all(0 < side <= LONGEST for side in size):
         raise BadInput(f"{what} is no size for a picture: sides are from 1 to {LONGEST} pixels")
+
+
+def with_black_hole(
+    image: np.ndarray,  # [H, W, 3] uint8
+    mask: np.ndarray,  # [H, W] bool
+    width: int,
+    height: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """What networks that paint are fed: the picture [height, width, 3] in [0, 1], 0 in the hole, and the hole, bool."""
+    hole = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
+    return scaled(image, width, height).astype(np.float32) / 255 * ~hole[..., None], hole
 
 
 def as_picture(answer: np.ndarray, who: str) -> np.ndarray:

@@ -1,4 +1,10 @@
-"""ONNX models: what they expect, and what they answer. ONNX Runtime runs them where it is installed, else OpenCV."""
+"""ONNX models: what they expect, and what they answer. ONNX Runtime runs them where it is installed, else OpenCV.
+
+What a model takes is read from its file, by the 45 lines of protocol buffers at the end: OpenCV runs networks and does
+not say what they take. ONNX Runtime says it, but only after it has loaded the weights, and its wheel is 28 MB more for
+every platform and Python; it stays an optional extra, so these lines and OpenCV's way cannot go. They take 0.3 ms for a
+model of 200 MB, and refuse sizes and channels that make no sense before anything is loaded.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +19,8 @@ import numpy as np
 from ..compute.threads import thread_count
 from ..errors import BadInput
 from .appearance import Painter
-from .calls import Call, waited
-from .networks import as_picture, check_size, path_and_size, times
+from .calls import Call, one_line, waited
+from .networks import as_picture, check_size, path_and_size, times, with_black_hole
 from .pasting import scaled
 
 FREE_SIZE = (512, 512)  # (width, height) for models that take any size
@@ -45,8 +51,7 @@ def painter(argument: str, call: Call) -> Painter:
     width, height = model.size(channels[max(channels)]) or size or FREE_SIZE
 
     def paint(image: np.ndarray, mask: np.ndarray, seed: int, call: Call) -> np.ndarray:
-        hole = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
-        picture = scaled(image, width, height).astype(np.float32) / 255 * ~hole[..., None]
+        picture, hole = with_black_hole(image, mask, width, height)
         parts = {3: picture, 1: hole[..., None], 4: np.dstack([picture, hole])}
         blobs = {name: parts[n].transpose(2, 0, 1)[None] for n, name in channels.items()}
         outputs = waited(path.name, lambda: model.run(blobs), call)
@@ -99,7 +104,7 @@ class OnnxModel:
                 raise
             reason = str(error)
         advice = "export it to a plain ONNX" if runtime else "install onnxruntime, or export it to a plain ONNX"
-        raise BadInput(f"{self.option}: {who} cannot run {self.path} ({' '.join(reason.split())[:200]}); {advice}")
+        raise BadInput(f"{self.option}: {who} cannot run {self.path} ({one_line(reason, 200)}); {advice}")
 
     def _by_opencv(self, feeds: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         level = cv2.setLogLevel(0)  # silent: its complaints come as exceptions too

@@ -1,4 +1,4 @@
-"""Pictures from outside: registered to the view, checked, and pasted into the hole (METHOD section 2)."""
+"""Pictures from outside: registered to the view, checked, and pasted into the hole."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from ..errors import BadInput
 from ..io.images import decode_image, encode_png
 from .appearance import Painter, Unfinished
 from .builtin import telea
-from .calls import Call, waited
+from .calls import Call, one_line, waited
 from .pasting import resized, scaled
 
 SHORTEST, LONGEST = 512, 1024  # px of the sides that diffusion models paint well; the longest side decides
@@ -81,8 +81,7 @@ def painter(address: str, call: Call) -> Painter:
 def painted_size(width: int, height: int) -> tuple[int, int]:
     """The (width, height) in which a picture of that size is painted."""
     factor = min(max(1.0, SHORTEST / min(width, height)), LONGEST / max(width, height))
-    sides = (max(MULTIPLE, round(factor * side / MULTIPLE) * MULTIPLE) for side in (width, height))
-    wide, high = sides
+    wide, high = (max(MULTIPLE, round(factor * side / MULTIPLE) * MULTIPLE) for side in (width, height))
     return wide, high
 
 
@@ -167,14 +166,12 @@ class _Server:
         except urllib.error.HTTPError as error:
             with error:
                 said = _said(error.read(1 << 16))
-            raise _Refused(
-                f"{self.option}: {self.url} refused ({error.code} {error.reason}): {said}", error.code
-            ) from None
+            words = f"{self.option}: {self.url} refused ({error.code} {error.reason}): {said}"
+            raise _Refused(words, error.code) from None
         except (OSError, HTTPException) as error:
             reason = getattr(error, "reason", None) or error
-            raise BadInput(
-                f"{self.option}: cannot reach {self.url} ({str(reason)[:200] or type(reason).__name__}); is it running?"
-            ) from None
+            words = str(reason)[:200] or type(reason).__name__
+            raise BadInput(f"{self.option}: cannot reach {self.url} ({words}); is it running?") from None
         if len(answer) > MOST_BYTES:
             raise BadInput(f"{self.option}: {self.url} answers with more than {MOST_BYTES >> 20} MB")
         return answer
@@ -186,7 +183,7 @@ class _Server:
             self.misunderstood(data[:60].decode("utf-8", "replace"))
 
     def misunderstood(self, what: str) -> NoReturn:
-        raise BadInput(f"{self.option}: cannot understand what {self.url} answered ({' '.join(what.split())})")
+        raise BadInput(f"{self.option}: cannot understand what {self.url} answered ({one_line(what)})")
 
 
 class _Refused(BadInput):
@@ -261,8 +258,8 @@ class _Comfy:
         status = done.get("status", {})
         for kind, what in status.get("messages", []):
             if kind == "execution_error":
-                words = f"{what.get('node_type')}: {what.get('exception_message')}"
-                raise BadInput(f"{self.server.option}: {self.server.url} failed in {' '.join(words.split())[:300]}")
+                words = one_line(f"{what.get('node_type')}: {what.get('exception_message')}")
+                raise BadInput(f"{self.server.option}: {self.server.url} failed in {words}")
         if status.get("status_str", "success") != "success":
             raise BadInput(f"{self.server.option}: {self.server.url} stopped before the picture was done")
         pictures = [p for output in done.get("outputs", {}).values() for p in output.get("images", [])]
@@ -296,25 +293,13 @@ class _Automatic:
     def paint(self, asked: _Asked) -> bytes:
         height, width = asked.mask.shape
         values = asked.values
-        request = {
-            "init_images": [base64.b64encode(encode_png(asked.image)).decode()],
-            "mask": base64.b64encode(encode_png(asked.mask)).decode(),
-            "mask_blur": SOFT_EDGE,
-            "inpainting_fill": 0 if values["strength"] == 1 else 1,  # 0: what stands there is blurred away, 1: kept
-            "inpaint_full_res": False,
-            "denoising_strength": values["strength"],
-            "prompt": values["prompt"],
-            "negative_prompt": values["negative"],
-            "seed": values["seed"],
-            "steps": STEPS,
-            "cfg_scale": GUIDANCE,
-            "width": width,
-            "height": height,
-            "resize_mode": 0,
-            "n_iter": 1,
-            "batch_size": 1,
-            "send_images": True,
-        }
+        image, mask = (base64.b64encode(encode_png(picture)).decode() for picture in (asked.image, asked.mask))
+        fill = 0 if values["strength"] == 1 else 1  # 0: what stands there is blurred away, 1: kept
+        request = {"init_images": [image], "mask": mask, "width": width, "height": height, "resize_mode": 0}
+        request |= {"prompt": values["prompt"], "negative_prompt": values["negative"], "seed": values["seed"]}
+        request |= {"steps": STEPS, "cfg_scale": GUIDANCE, "denoising_strength": values["strength"]}
+        request |= {"mask_blur": SOFT_EDGE, "inpainting_fill": fill, "inpaint_full_res": False}
+        request |= {"n_iter": 1, "batch_size": 1, "send_images": True}
         if values["checkpoint"]:
             request["override_settings"] = {"sd_model_checkpoint": values["checkpoint"]}
         answer = self.server.post("/sdapi/v1/img2img", request)
@@ -380,4 +365,4 @@ def _said(body: bytes) -> str:
             parts += [f"{node['class_type']}: {e['message']}, {e['details']}" for e in node["errors"]]
         parts += [document.get("errors"), document.get("detail")]
         text = "; ".join(str(part) for part in parts if part) or text
-    return " ".join(text.split())[:300]
+    return one_line(text)

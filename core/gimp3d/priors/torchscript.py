@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..compute.threads import thread_count
 from ..errors import BadInput
 from .appearance import Painter
 from .calls import Call, waited
-from .networks import as_picture
+from .networks import as_picture, times, with_black_hole
 from .pasting import scaled
 
 MULTIPLE = 8  # px; LaMa's encoder halves a picture three times
@@ -88,8 +87,7 @@ def painter(argument: str, call: Call) -> Painter:
         h, w = mask.shape
         factor = min(1.0, LONGEST_SIDE / max(h, w))
         width, height = max(1, round(factor * w)), max(1, round(factor * h))
-        hole = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
-        picture = scaled(image, width, height).astype(np.float32) / 255 * ~hole[..., None]
+        picture, hole = with_black_hole(image, mask, width, height)
         more = ((0, -height % MULTIPLE), (0, -width % MULTIPLE))
         inputs = [
             np.pad(picture, (*more, (0, 0)), mode="symmetric").transpose(2, 0, 1)[None],
@@ -100,10 +98,8 @@ def painter(argument: str, call: Call) -> Painter:
             raise BadInput(f"{model.who} answers with no picture")
         answer = as_picture(answers[0], model.who)
         if answer.shape[:2] != inputs[0].shape[2:]:
-            raise BadInput(
-                f"{model.who} answers with {answer.shape[1]}×{answer.shape[0]} pixels to a picture of "
-                f"{inputs[0].shape[3]}×{inputs[0].shape[2]}"
-            )
+            sizes = (times(a[::-1]) for a in (answer.shape[:2], inputs[0].shape[2:]))
+            raise BadInput("{} answers with {} pixels to a picture of {}".format(model.who, *sizes))
         return scaled(answer[:height, :width], w, h)
 
     return Painter(model.path.name, paint, f"the picture that {model.path} painted")
