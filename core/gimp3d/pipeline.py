@@ -18,6 +18,7 @@ from .compute import buffers
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .gaussians import Gaussians
+from .geometry import disparity_of, sees, window_mask
 from .priors.calls import Call
 from .priors.inpaint import Appearance, check_provider, inpaint_reference, painter, paste_picture
 from .priors.monodepth import check_depth_prior, depth_prior, looks
@@ -35,9 +36,8 @@ from .stages.layers import LayerSettings
 from .stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from .stages.light_search import Light
 from .stages.mapping import MappingField, MappingSettings, mapping_field, source_visibility
-from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks, sees
+from .stages.masks import Masks, MaskSettings, ViewMasks, find_masks
 from .stages.occluder import Occluder
-from .stages.outline import window_mask
 from .stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -54,7 +54,6 @@ from .stages.reference import (
     ReferenceSettings,
     ViewScore,
     choose_reference,
-    disparity_of,
     gather_evidence,
     rim,
 )

@@ -16,6 +16,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import Gaussians
+from gimp3d.geometry import window_mask
 from gimp3d.io.images import write_png
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import (
@@ -30,7 +31,6 @@ from gimp3d.pipeline import (
 )
 from gimp3d.raster import footprint, surface_depth, touched_window
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
-from gimp3d.stages.outline import window_mask
 from gimp3d.stages.propagate import Rule
 
 SETTINGS = MaskSettings()

@@ -16,20 +16,12 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
+from ..geometry import cropped, surface_points, window_mask, window_round
 from ..progress import Progress, silent
 from ..raster import drawing, render, touched_window
 from ..schema import Positive, Share
 from .growth import NOTHING, Growth, GrowthSettings, find_growth
-from .outline import (
-    Window,
-    box_polygon,
-    cropped,
-    fill_polygon,
-    guard_gaussians,
-    surface_points,
-    window_mask,
-    window_round,
-)
+from .outline import Window, box_polygon, fill_polygon, guard_gaussians
 from .selection import (
     Fate,
     Selection,
@@ -387,7 +379,7 @@ def _choose(
         return Sighting(view.camera, shows, view.extra is not None)
 
     sightings = parallel_map(lambda k: sighting(views[k], *seen[k]), range(len(views)))
-    near = near_region(gaussians, objects, settings)
+    near = near_region(gaussians, objects)
     weights = weigh(gaussians, near, sightings)
     selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o], settings)
     if settings.support > 0:
@@ -541,23 +533,6 @@ def _continues_outside(
     covered = np.bincount(surface[there & touched], minlength=count)
     enough = np.maximum(settings.least_outside, settings.least_border * settings.around * np.sqrt(covered))
     return there & (outside >= enough)[surface]
-
-
-def sees(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z of the first surface, 0 = nothing
-    points: np.ndarray,  # [N, 3] world
-    tolerance: float,  # relative
-) -> np.ndarray:
-    """[N] bool: the point is framed and is the surface seen there (z-test)."""
-    uv, z = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        framed = (z > 0) & (uv >= 0).all(-1) & (uv[..., 0] < camera.width) & (uv[..., 1] < camera.height)
-    result = np.zeros(len(points), dtype=bool)
-    cols, rows = uv[framed].astype(int).T
-    there = depth[rows, cols]
-    result[framed] = (there > 0) & (np.abs(there - z[framed]) < tolerance * z[framed])
-    return result
 
 
 def _tidy(

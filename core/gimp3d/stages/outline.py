@@ -1,8 +1,6 @@
-"""Where things lie in a view: a box's outline, the window that holds it, and that part of the view as a camera."""
+"""A box in a view: its outline, the window that holds it, and the guard band round it (paper 3.2)."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +8,7 @@ import numpy as np
 from ..box import Box
 from ..camera import Camera
 from ..gaussians import Gaussians
-from ..raster import Window
+from ..geometry import Window, window_round
 
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
 
@@ -81,53 +79,9 @@ def guard_gaussians(
     return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
 
 
-def window_round(
-    points: np.ndarray,  # [N, 2] pixels
-    camera: Camera,
-    margin: int = 0,  # pixels
-) -> Window:
-    """The rectangle round the points and a margin, within the picture; never empty."""
-    size = np.array([camera.width, camera.height])
-    ends = [points.min(0), points.max(0)] if len(points) else [size / 2, size / 2]
-    low = np.clip(np.floor(ends[0]) - margin, 0, size - 1).astype(int)
-    high = np.clip(np.ceil(ends[1]) + margin, low + 1, size).astype(int)
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
 def box_window(box: Box, camera: Camera) -> Window:
     """The rectangle that holds a box; the whole picture if the box reaches behind the camera."""
     corners = box.corners()
     if (camera.to_camera(corners)[:, 2] <= 0).any():
         return slice(0, camera.height), slice(0, camera.width)
     return window_round(camera.project(corners)[0], camera, 1)
-
-
-def window_mask(window: Window, camera: Camera) -> np.ndarray:
-    """[H, W] bool: the pixels of a view that lie in a window."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    mask[window] = True
-    return mask
-
-
-def cropped(camera: Camera, window: Window) -> Camera:
-    """The part of a view in a window, with exact intrinsics."""
-    rows, cols = window
-    return replace(
-        camera,
-        width=cols.stop - cols.start,
-        height=rows.stop - rows.start,
-        cx=camera.cx - cols.start,
-        cy=camera.cy - rows.start,
-    )
-
-
-def surface_points(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z, 0 = nothing
-    window: Window,
-    step: int = 1,  # only every step-th row and column
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows [N], columns [N] and scene points [N, 3] of the pixels in a window that show a surface."""
-    rows, cols = np.nonzero(depth[window][::step, ::step] > 0)
-    rows, cols = step * rows + window[0].start, step * cols + window[1].start
-    return rows, cols, camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))

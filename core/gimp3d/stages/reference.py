@@ -12,10 +12,11 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
+from ..geometry import SOLID, bounds, colours_at, dilated, directions, disparity_of, framed, sees, surface_normals
 from ..schema import AtLeastOne, Many, Share
 from ..solvers.thin_plate import ThinPlateSettings
 from .depth import DepthSettings, complete_disparity
-from .masks import ViewMasks, sees
+from .masks import ViewMasks
 
 PROVISIONAL = DepthSettings(
     plate=ThinPlateSettings(unknowns=1000), small_part=300
@@ -54,48 +55,15 @@ class ReferenceChoice:
     reason: str
 
 
-def surface_normals(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z-depth, 0 = nothing
-) -> np.ndarray:
-    """Unit normals [H, W, 3] of a depth map in camera axes, facing the camera; 0 where depth is missing."""
-    points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)) @ camera.R.T
-    right, down = _difference(points, 1), _difference(points, 0)
-    normals = np.cross(down, right)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    valid = (depth > 0)[..., None] & (length > 0)
-    return np.where(valid, normals / np.where(length > 0, length, 1), 0.0)
-
-
-def _difference(points: np.ndarray, axis: int) -> np.ndarray:
-    """One-sided differences of [H, W, 3] points, to the side where depth changes less: edges do not tilt normals."""
-    if points.shape[axis] < 2:
-        return np.zeros_like(points)
-    step = np.diff(points, axis=axis)
-    first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
-    forward, backward = np.concatenate([step, last], axis), np.concatenate([first, step], axis)
-    return np.where(np.abs(forward[..., 2:]) <= np.abs(backward[..., 2:]), forward, backward)
-
-
 def facing(
     camera: Camera,
     depth: np.ndarray,  # [H, W]
 ) -> np.ndarray:
     """cos θ between each surface element and its viewing ray, [H, W] in [0, 1]."""
-    rays = np.concatenate(
-        [
-            (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy],
-            np.ones(depth.shape)[..., None],
-        ],
-        -1,
-    )
+    across = (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    rays = np.concatenate([across, np.ones(depth.shape)[..., None]], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     return np.clip(-(surface_normals(camera, depth) * rays).sum(-1), 0.0, 1.0)
-
-
-def disparity_of(depth: np.ndarray) -> np.ndarray:
-    """1/z [H, W] float32, 0 where there is nothing (METHOD section 0)."""
-    return np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
 
 
 def rim(view: ViewMasks, solid: float) -> np.ndarray:
@@ -112,7 +80,7 @@ class NeededSurface:
 
 
 def needed_surface(
-    views: Sequence[ViewMasks], solid: float = 0.9, settings: ReferenceSettings = ReferenceSettings()
+    views: Sequence[ViewMasks], solid: float = SOLID, settings: ReferenceSettings = ReferenceSettings()
 ) -> NeededSurface:
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
     seeing = [v for v in views if v.target.sum() >= settings.minimum_pixels]
@@ -150,8 +118,7 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
     A surface that is only sampled need not be completed at every pixel.
     """
     margin = step * (PROVISIONAL.planes.ring + 2)
-    ends = ((x[0], x[-1]) for x in (np.flatnonzero(view.target.any(1 - axis)) for axis in (0, 1)))
-    rows, cols = (slice(max(0, int(first) - margin), int(last) + margin + 1, step) for first, last in ends)
+    rows, cols = (slice(s.start, s.stop, step) for s in bounds(view.target, margin))
     height, width = view.target[rows, cols].shape
     c = view.camera
     cx, cy = (c.cx - cols.start - 0.5) / step + 0.5, (c.cy - rows.start - 0.5) / step + 0.5
@@ -162,7 +129,7 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
-    solid: float = 0.9,
+    solid: float = SOLID,
     settings: ReferenceSettings = ReferenceSettings(),
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
@@ -214,20 +181,18 @@ def choose_reference(
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
     """cos θ and pixels per area [S] of each sample in a view's hole; both 0 where it does not show it."""
     camera = view.camera
-    uv, z = camera.project(surface.points)
-    with np.errstate(invalid="ignore"):
-        framed = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    cols, rows = np.where(framed[:, None], uv, 0).astype(int).T
-    cosine = -(surface.normals * _directions(surface.points, camera)).sum(-1)
-    shown = framed & view.target[rows, cols] & (cosine > 0)
-    density = cosine * camera.fx * camera.fy / np.where(shown, z, 1) ** 2
-    return np.where(shown, cosine, 0.0), np.where(shown, density, 0.0)
+    index, rows, cols, z = framed(camera, surface.points)
+    cosine = -(surface.normals * directions(surface.points, camera)).sum(-1)
+    shown = view.target[rows, cols] & (cosine[index] > 0)
+    index, z = index[shown], z[shown]
+    found = np.zeros((2, len(cosine)))
+    found[:, index] = cosine[index], cosine[index] * camera.fx * camera.fy / z**2
+    return found[0], found[1]
 
 
 def _has_rim(view: ViewMasks, solid: float) -> bool:
     """Whether anything known bounds the hole."""
-    grown = cv2.dilate(view.target.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return bool((grown & rim(view, solid)).any())
+    return bool((dilated(view.target, 1) & rim(view, solid)).any())
 
 
 def _plan(
@@ -275,31 +240,23 @@ def gather_evidence(
     """
     rows, cols = np.nonzero(target & (depth > 0))
     points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
-    rays = _directions(points, camera)
+    rays = directions(points, camera)
     best = np.full(len(points), -1.0)
     colours = np.zeros((len(points), 3), np.uint8)
     for other, photo, seen_depth in views:
-        cosine = (rays * _directions(points, other)).sum(-1)
+        cosine = (rays * directions(points, other)).sum(-1)
         open_points = np.flatnonzero(cosine > best)
         clear = sees(other, _without_occluders(seen_depth, settings), points[open_points], settings.tolerance)
         found = open_points[clear]
         if len(found):
-            uv, _ = other.project(points[found])
-            x, y = (uv.astype(np.float32) - 0.5).T[:, :, None]
-            colours[found] = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+            colours[found] = colours_at(photo, other.project(points[found])[0])
         best[found] = cosine[found]
     image = np.zeros((*target.shape, 3), np.uint8)
     image[rows, cols] = colours
     seen = np.zeros(target.shape, bool)
     seen[rows, cols] = best > -1
-    unseen = (target & ~seen).astype(np.uint8)
-    seen &= cv2.dilate(unseen, np.ones((2 * settings.contact + 1,) * 2, np.uint8)) == 0
+    seen &= ~dilated(target & ~seen, settings.contact)
     return Evidence(image, seen)
-
-
-def _directions(points: np.ndarray, camera: Camera) -> np.ndarray:
-    towards = points - camera.centre
-    return towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-12)
 
 
 def _without_occluders(depth: np.ndarray, settings: EvidenceSettings) -> np.ndarray:

@@ -14,14 +14,12 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
+from ..geometry import cropped, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import AtLeastOne, Between, Positive, Share
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
-from .masks import sees
-from .outline import cropped, window_mask
 from .propagate import PaintedView, Rule
-from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
 SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all

@@ -15,12 +15,14 @@ from ..box import Region, in_region
 from ..camera import Camera
 from ..compute.threads import parallel_map, run_ranges
 from ..gaussians import Gaussians, quats_to_matrices
+from ..geometry import surface_points
 from ..raster import label_weights
 from ..schema import Share
-from .outline import box_window, surface_points
+from .outline import box_window
 from .surroundings import Surroundings, SurroundingsSettings
 
 R = TypeVar("R")
+NEAR = 0.5  # how far from a box what only the removal reveals is looked for, as a share of the box's longest edge
 BATCH = 32  # views whose weights are held at once
 PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
 
@@ -53,7 +55,6 @@ class SelectionSettings:
     support: Share = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
     least_object: Share = 0.002  # share of the region's outline that an object fills in some view to stand in a box
     least_cells: float = 4.0  # of the surroundings along a box; in coarser ones its centre decides of a Gaussian
-    near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
     misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
     least_misfit: Share = 0.1  # … and by so much, colours in [0, 1]
     surroundings: SurroundingsSettings = SurroundingsSettings()
@@ -217,9 +218,13 @@ def surface_in(
     return found
 
 
-def near_region(gaussians: Gaussians, region: Region, settings: SelectionSettings = SelectionSettings()) -> np.ndarray:
+def near_region(
+    gaussians: Gaussians,
+    region: Region,
+    near: float = NEAR,  # see _surrounds
+) -> np.ndarray:
     """[N] bool: rows of whose fate something but extra masks can decide."""
-    return _reaches(gaussians, region) | _surrounds(gaussians, region, settings)
+    return _reaches(gaussians, region) | _surrounds(gaussians, region, near)
 
 
 def weigh(
@@ -324,17 +329,17 @@ def without_revealed(
 
     Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them.
     """
-    near = _surrounds(gaussians, region, settings)
+    near = _surrounds(gaussians, region)
     found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
     return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
 
 
-def _surrounds(gaussians: Gaussians, region: Region, settings: SelectionSettings) -> np.ndarray:
+def _surrounds(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.ndarray:
     """[N] bool: the centre lies in a box or so near that a smear of the object may reach it."""
     found = np.zeros(len(gaussians), bool)
     for box in region:
         local = (gaussians.means - box.center) @ box.axes
-        found |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
+        found |= (np.abs(local) < box.size / 2 + near * box.size.max()).all(1)
     return found
 
 

@@ -18,8 +18,9 @@ from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
+from ..geometry import surface_points
 from ..schema import AtLeastOne, Degrees, Many, Positive, Share
-from .outline import box_window, surface_points
+from .outline import box_window
 
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix

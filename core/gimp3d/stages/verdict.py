@@ -18,14 +18,14 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import SAME_DEPTH, colours_at, framed, sees
 from ..raster import drawing, render
 from ..solvers.variogram import at_lag, foretell, variogram
 from .charts import Chart, Hits
-from .masks import ViewMasks, sees
+from .masks import ViewMasks
 from .propagate import Reference
 from .witness import Says, Witness, ask
 
-SAME = 0.02  # relative z within which two views show one surface
 EDGE = 3  # px next to the object that are mixed
 SCATTER = 4.0  # median distances of the drawn surface from a chart, from which something is before the chart
 UNLIKE = 24.0  # grey levels from which the object differs from what is behind it
@@ -152,7 +152,7 @@ def judge(
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
     total = sum(int(look.view.silhouette.sum()) for look in looks)
     step = max(1, round(math.sqrt(total / settings.points)))
-    tolerance = max([c.tolerance for c in charts], default=SAME)
+    tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
     samples = parallel_map(lambda x: _sampled(x, step, witnesses, tolerance, given), looks)
     return _summed(looks, samples, still_open, views, bool(photographed), bool(charts))
 
@@ -221,7 +221,7 @@ def _alike(looks: Sequence[_Look], samples: Sequence[_Sample]) -> np.ndarray:
     found = []
     for k, sample in enumerate(samples):
         found.append(_squared(sample.after, sample.expected)[sample.object & sample.told] <= limit)
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME)
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME_DEPTH)
         found.append((_squared(sample.after[sample.unseen], colours) <= limit)[seen])
     return np.concatenate(found)
 
@@ -265,7 +265,7 @@ def _sharpness(looks: Sequence[_Look]) -> float | None:
         grey = cv2.cvtColor(look.after, cv2.COLOR_RGB2GRAY)
         detail = np.abs(grey - cv2.GaussianBlur(grey, (0, 0), FINE))
         inner = cv2.erode(look.view.target.astype(np.uint8), np.ones((2 * EDGE - 1,) * 2, np.uint8)) > 0
-        on_chart = (look.chart == 0) | (np.abs(look.depth - look.chart) < SAME * look.chart)
+        on_chart = (look.chart == 0) | (np.abs(look.depth - look.chart) < SAME_DEPTH * look.chart)
         filled.append(detail[inner])
         beside.append(detail[look.ring & on_chart & (look.depth > 0)])
     if not any(map(np.size, filled)) or not any(map(np.size, beside)):
@@ -285,20 +285,22 @@ def _sampled(
     centres = camera.pixel_centres()[thin]
     # charts are what was behind the object, unless photos show what is drawn before them
     standing = object_ & (depth > 0) & (depth < (1 - tolerance) * chart)
-    standing[standing] = shown(others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME)[1]
+    standing[standing] = shown(
+        others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME_DEPTH
+    )[1]
     off_chart = (chart == 0) | standing | (ring & (np.abs(depth - chart) > tolerance * chart))
     surface = np.where(off_chart, depth, chart)
     points = camera.unproject(centres, surface.astype(np.float64))
     asked = (object_ | ring) & (surface > 0)
     told, by_picture = np.zeros((2, *asked.shape), bool)
     expected = photo.copy()
-    colours, told[asked] = shown(others, points[asked], SAME, tolerance)
+    colours, told[asked] = shown(others, points[asked], SAME_DEPTH, tolerance)
     expected[told] = colours[told[asked]]
     if given is not None:
         left = object_ & asked & ~told
         depth_given = np.where(given.target, given.depth, 0)
         by_picture[left] = sees(given.camera, depth_given, points[left], tolerance)
-        expected[by_picture] = _colours(given.image, given.camera, points[by_picture])
+        expected[by_picture] = colours_at(given.image, given.camera.project(points[by_picture])[0])
     foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~object_ | told | by_picture)
     unknown = object_ & ~told & ~by_picture
     expected[unknown] = foretold[unknown]
@@ -320,23 +322,11 @@ def shown(
     seen &= ask(witnesses, points, tolerance) != Says.BEHIND
     colours = np.full((len(witnesses), len(points), 3), np.nan, np.float32)
     for k, witness in enumerate(witnesses):
-        colours[k, seen[k]] = _colours(witness.photo, witness.camera, points[seen[k]])
+        colours[k, seen[k]] = colours_at(witness.photo, witness.camera.project(points[seen[k]])[0])
     told, median = seen.any(0), np.zeros((len(points), 3), np.float32)
     if told.any():
         median[told] = np.nanmedian(colours[:, told], axis=0)
     return median, told
-
-
-def _colours(
-    picture: np.ndarray,  # [H, W, 3] uint8
-    camera: Camera,
-    points: np.ndarray,  # [N, 3]
-) -> np.ndarray:
-    """[N, 3] float32, between pixels."""
-    if not len(points):
-        return np.zeros((0, 3), np.float32)
-    x, y = (camera.project(points)[0] - 0.5).astype(np.float32).T[:, :, None].copy()
-    return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.float32)
 
 
 def _shift(look: _Look, thin: tuple[slice, slice], points: np.ndarray, surface: np.ndarray, eye: Camera) -> np.ndarray:
@@ -361,15 +351,12 @@ def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence
     points = gaussians.means.astype(np.float64)
     before, other = np.zeros((2, len(points)), bool)
     for chart in charts:
-        uv, z = chart.camera.project(points)
-        with np.errstate(invalid="ignore"):
-            framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
-        cols, rows = uv[framed].astype(int).T
-        nearer = z[framed] < chart.depth[rows, cols] - SCATTER * chart.noise
-        before[framed] |= chart.there[rows, cols] & nearer
-        other[framed] |= chart.there[rows, cols] & ~nearer
+        index, rows, cols, z = framed(chart.camera, points)
+        there, nearer = chart.there[rows, cols], z < chart.depth[rows, cols] - SCATTER * chart.noise
+        before[index] |= there & nearer
+        other[index] |= there & ~nearer
     rows = np.flatnonzero(before & ~other & gaussians.usable)
-    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME))
+    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME_DEPTH))
     found = np.zeros(len(points), bool)
     found[rows] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     return found

@@ -17,6 +17,7 @@ from gimp3d.box import Box, read_region
 from gimp3d.camera import Camera
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput, IllPosed
+from gimp3d.geometry import sees
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import load_view, read_mask
 from gimp3d.io.ply import read_ply
@@ -27,7 +28,7 @@ from gimp3d.raster.backend import CpuBackend
 from gimp3d.raster.cpu_drawing import CpuDrawing
 from gimp3d.stages import masks as stage
 from gimp3d.stages import selection
-from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks, sees
+from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
 from gimp3d.stages.selection import Fate, SelectionSettings
 
 RIM = np.ones((3, 3), np.uint8)  # a 1-px rim on every side

@@ -10,16 +10,10 @@ from scenes import cameras, scene
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
+from gimp3d.geometry import cropped, surface_points, window_round
 from gimp3d.orbit import look_at
 from gimp3d.raster import footprint, render, surface_depth, touched_window
-from gimp3d.stages.outline import (
-    box_polygon,
-    box_window,
-    cropped,
-    fill_polygon,
-    surface_points,
-    window_round,
-)
+from gimp3d.stages.outline import box_polygon, box_window, fill_polygon
 
 
 def some_camera(rng: np.random.Generator, eye: np.ndarray) -> Camera:

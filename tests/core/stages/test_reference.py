@@ -10,6 +10,7 @@ from scenes import REGION, cameras, scene, truth
 
 from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
+from gimp3d.geometry import surface_normals
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
@@ -22,7 +23,6 @@ from gimp3d.stages.reference import (
     facing,
     gather_evidence,
     needed_surface,
-    surface_normals,
 )
 
 UP = np.array([0, 0, 1.0])
