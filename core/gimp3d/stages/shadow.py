@@ -14,8 +14,9 @@ import scipy.ndimage
 
 from ..box import Region
 from ..gaussians import Gaussians
+from ..geometry import dilated
 from ..solvers.lights import Shading
-from .charts import Plane, extent
+from .charts.plane import Plane, extent
 from .ground import FEWEST, ROUGH, Ground
 from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
 from .occluder import Occluder
@@ -193,7 +194,6 @@ def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Se
     marked = ((2 * votes > voters) & (voters > 0)).reshape(ground.known.shape).astype(np.float32)
     # what the object hides lies in its shadow, or the edge of the mask beside it would be one of light
     hole = ((said == Says.HIDDEN).any(0) & (voters == 0)).reshape(ground.known.shape)
-    near = cv2.dilate(marked, np.ones((5, 5), np.uint8)) > 0
     labels, _ = scipy.ndimage.label(hole)
-    marked[np.isin(labels, np.unique(labels[hole & near]))] = 1.0
+    marked[np.isin(labels, np.unique(labels[hole & dilated(marked > 0, 2)]))] = 1.0
     return np.stack([cv2.GaussianBlur(marked, (0, 0), sigma) for sigma in EDGES], -1)
