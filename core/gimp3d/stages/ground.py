@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
-import cv2
 import numpy as np
 
 from ..box import Region
@@ -26,23 +25,17 @@ DENSITY = 48  # texels per diagonal in which lights are settled; they are sought
 ENOUGH = 64  # points that tell where a few texels lie
 ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 100  # texels of a surface that is looked at
-BESIDE = 2  # texels beside what the object hides that may show some of it, at least …
-BLURRED = 3.0  # … and pixels of the views that show the place best
-POINTS = 60_000  # of what views show, in which walls are sought …
-FLAT = 0.03  # … diagonals from a plane within which they lie on it …
-MUCH = 0.25  # … and the share of those that stand round the object that a wall holds
+BESIDE = 2  # texels beside what the object hides that may show some of it, at least
+BLURRED = 3.0  # pixels of the views that show the place best; so much beside it may show some of the object, too
+WALL_POINTS = 60_000  # points of surface, about, among which walls are sought
+WALL_INLIER = 0.03  # diagonals of the region from a plane within which a point lies on it
+WALL_SHARE = 0.25  # share of the points above the known planes that a wall holds
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
 
 
 @dataclass(frozen=True)
 class Ground(Facing):
     """What photos show of a surface round the object, coarsely."""
-
-    def points(self, scale: float = 1) -> np.ndarray:
-        """[h, w, 3] scene coordinates of its texels, or of smaller ones."""
-        camera = self.camera.scaled(scale)
-        z = cv2.resize(self.depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-        return camera.unproject(camera.pixel_centres(), z.astype(np.float64))
 
 
 def look_at(
@@ -59,14 +52,14 @@ def _walls(
 ) -> list[Plane]:
     """Planes beside the object, which it hides nowhere, that hold most of what stands round it."""
     diagonal = extent(region)
-    points, _ = surface_beside(views, witnesses, POINTS)
+    points, _ = surface_beside(views, witnesses, WALL_POINTS)
     points = points[(np.abs(points - planes[0].origin) < REACH * diagonal).all(1)]
     for plane in planes:
-        points = points[plane.local(points)[:, 2] > FLAT * diagonal]
+        points = points[plane.local(points)[:, 2] > WALL_INLIER * diagonal]
     cameras, rng = np.array([v.camera.centre for v in views]), np.random.default_rng(0)
     found: list[Plane] = []
-    least = MUCH * len(points)
-    while candidate := largest_plane(points, np.ones(len(points)), FLAT * diagonal, cameras, region, rng):
+    least = WALL_SHARE * len(points)
+    while candidate := largest_plane(points, np.ones(len(points)), WALL_INLIER * diagonal, cameras, region, rng):
         plane, on = candidate
         if on.sum() < max(least, FEWEST):
             break

@@ -28,13 +28,13 @@ EVEN = 0.02  # share of light up to which their neighbours are as they are
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
-UNRELIABLE = 0.1  # share of the ground that is drawn that much nearer, from which depths tell nothing
-MIXED = 0.75  # the same right beside the object, whose own colours, in the same pixels, would be lifted too
+UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
+MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
 COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
 LOOKS = 12  # views by which colours are corrected
-CORRECTIONS, HOLD = 3, 3.0  # steps, and px of blend weight by which lifted colours are held, which are nearly right
-UNMIRRORING, LOOSE = 10, 0.03  # the same for those of a reflection, which are quite others
+CORRECTIONS, HOLD = 3, 3.0  # steps of least squares, and px of blend weight by which lifted colours are held
+UNMIRRORING, LOOSE = 10, 0.03  # the same where a reflection goes: colours without it are farther from the old ones
 SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 
 

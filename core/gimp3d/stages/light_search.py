@@ -15,22 +15,22 @@ from .ground import Ground
 from .occluder import Occluder
 
 DARK = 2e-3  # of linear light, noise of a photo's
-LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of blocks whose luminance is compared …
-BROAD = (8, 16)  # … and of whole ones to tell how strong lights are: finer ones see edges, which no cast meets exactly
+LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of the blocks whose luminance is compared
+BROAD = (8, 16)  # texels of whole grounds: sides of the blocks that tell strengths; no cast meets finer edges exactly
 DIRECTIONS = 384  # about 8° apart
 LOWEST = 8.0  # degrees above the support: light that comes from lower down is no light's
-SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried …
-SOFT_RANGE = (0.5, 45.0)  # … between which it is settled …
-ROUND = (384, 160, 32)  # … and how many of each
+SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried
+LOBES = (384, 160, 32)  # directions in which lobes of each softness are tried
+SOFT_RANGE = (0.5, 45.0)  # degrees between which softness is settled
 SAMPLES = 48  # rays to a light
 SKY = 96  # and to the sky
 MOST = 3  # lights
-COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled …
-MOST_ROUNDS = 8  # … each so often at most
-ELSEWHERE = 8  # places of the object that it might as well have …
-ASIDE = 1.1  # … so many of its widths away
-EARNS = 1.3  # times what chance explains, that a light must explain …
-FITS = 0.52  # … and the share of what is uneven where its shadow falls
+COARSEST, FINEST = 4.0, 1.0  # degrees, first and last step by which lights are settled
+MOST_ROUNDS = 8  # of settling by each step
+ELSEWHERE = 8  # other places of the object, which tell what chance explains
+ASIDE = 1.1  # widths of the object from its place to those
+EARNS = 1.3  # times what chance explains that a light must explain
+FITS = 0.52  # share of what is uneven where its shadow falls that a light must explain
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 FAINT = 0.03  # share of light below which nothing is a shadow
 
@@ -127,7 +127,7 @@ class _Sky:
     def make(cls) -> _Sky:
         rays = _hemisphere(DIRECTIONS)
         lobes, towards, softness = [], [], []
-        for width, count in zip(SOFTNESS, ROUND):
+        for width, count in zip(SOFTNESS, LOBES):
             middle = _hemisphere(count)
             apart = np.degrees(np.arccos(np.clip(rays @ middle.T, -1, 1)))
             lobe = np.exp(-0.5 * (apart / width) ** 2)

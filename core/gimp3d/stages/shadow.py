@@ -14,7 +14,7 @@ import scipy.ndimage
 
 from ..box import Region
 from ..gaussians import Gaussians
-from ..geometry import dilated
+from ..geometry import colours_at, dilated
 from ..solvers.lights import Shading
 from .charts.plane import Plane, extent
 from .ground import FEWEST, ROUGH, Ground
@@ -51,9 +51,7 @@ class Shadow:
         if ground >= 0:
             taken, (h, w) = self.taken[ground], self.grounds[ground].known.shape
             uv, _ = self.grounds[ground].camera.project(points)
-            at = uv * [taken.shape[1] / w, taken.shape[0] / h] - 0.5
-            x, y = at.astype(np.float32).T[:, :, None]
-            return 1 - cv2.remap(taken, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
+            return 1 - colours_at(taken, uv * [taken.shape[1] / w, taken.shape[0] / h]).astype(np.float64)
         light = np.ones((len(points), 3))
         if self.occluder is not None:
             uv, _ = self.grounds[0].camera.project(points)

@@ -56,3 +56,11 @@ def test_dim_pixels_right_beside_the_object_are_filled_and_not_lifted() -> None:
         np.testing.assert_array_equal(dark, filled)
         np.testing.assert_array_equal(shaded, ~hidden)
         assert (photo[shaded] > 60).all() and (photo[hidden] == 60).all()
+
+
+def test_light_is_told_at_more_points_than_opencv_samples_at_once() -> None:
+    shadow = prepared()[1]
+    points = shadow.grounds[0].points().reshape(-1, 3)
+    assert len(points) > 1 << 15
+    parts = [shadow.arriving(p, 0) for p in np.array_split(points, 2)]
+    np.testing.assert_array_equal(shadow.arriving(points, 0), np.concatenate(parts))

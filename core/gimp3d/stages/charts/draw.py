@@ -73,9 +73,7 @@ def draw_charts(
 
 def _bounded(chart: Chart, charts: Sequence[Chart]) -> Chart:
     """The chart, ended where it goes through another one that all photos show it before: a floor at a wall."""
-    x, y = chart.camera.pixel_centres().reshape(-1, 2).T
-    points = chart.camera.unproject(np.stack([x, y], -1), chart.depth.ravel().astype(np.float64))
-    there = chart.there
+    points, there = chart.points().reshape(-1, 3), chart.there
     shown = there & (chart.photos > 0)
     for other in charts:
         if chart.plane.crosses(other.plane):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ...camera import Camera
@@ -25,6 +26,12 @@ class Facing:
     image: np.ndarray  # [H, W, 3] uint8, from photos; 0 where none shows it
     known: np.ndarray  # bool, photos show it, and much the same
     hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
+
+    def points(self, scale: float = 1) -> np.ndarray:
+        """[h, w, 3] scene coordinates of its texels, or of smaller ones."""
+        camera = self.camera.scaled(scale)
+        z = cv2.resize(self.depth, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        return camera.unproject(camera.pixel_centres(), z.astype(np.float64))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ ENOUGH_POINTS = 3  # of a cell
 TELLING = 100  # cells or texels that tell how depths lie
 HEIGHT = 0.25  # diagonals of the region, of a relief at most: what is higher stands on the surface
 SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
-SUNK = 0.97  # share of the photos' agreement that a plane keeps where it is laid onto the drawn surface
 
 
 @dataclass(frozen=True)
@@ -94,15 +93,11 @@ def lay_surface(
     offset, known = drawn
     completed = np.nan_to_num(thin_plate(offset, known.astype(float), np.ones(known.shape, bool))).astype(np.float32)
     relief = at(cv2.resize(completed, flat.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
-    if 1 - relief.agreement < settings.relief * (1 - level.agreement):
-        chosen = relief
-    else:
-        # splats are drawn a little behind the surface that they show: new ones must lie where they do
-        near = offset[known & (np.abs(offset) < SINKS * extent(region))]
-        sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
-        chosen = sunk if sunk.agreement >= SUNK * level.agreement else level
+    # splats are drawn a little behind the surface that they show: new ones must lie where they do
+    near = offset[known & (np.abs(offset) < SINKS * extent(region))]
+    sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
     return replace(
-        chosen,
+        relief if 1 - relief.agreement < settings.relief * (1 - level.agreement) else sunk,
         reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
         noise=float(np.median(np.abs(offset[known]))),
     )
