@@ -11,29 +11,31 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
-from ..geometry import sees, window_mask
+from ..geometry import dilated, sees, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
 from .charts import Chart, Hits, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
-from .witness import Says, Witness, ask
+from .witness import Says, Witness, ask, total_over
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
+SOME_WEIGHT = 0.1  # blend weight of the removed Gaussians from which a photo may show some of the object
+RIM = 1  # px by which the object is larger in the photo than in the splats
+SPECK = 3  # px; smaller spots are splats of the floor that went along
+HAZE_WEIGHT = 0.5  # px of blend weight, over all views, below which a Gaussian draws nothing
+LOW = 0.1  # diagonals of the region above the surface up to which a rest of the object may stand
+REACH = 24  # px round the removed Gaussians in which the scene is drawn anew: their dilated surroundings
+TOUCHED = 0.05  # blend weight of the removed Gaussians from which a pixel changes
+SURFACE = 0.5  # opacity below which the scene has no surface
 
 
 @dataclass(frozen=True)
 class ClearingSettings:
-    """When a Gaussian is haze, and what a view's target is."""
+    """What counts as the object in photos, and as haze."""
 
-    object_weight: Share = 0.25  # blend weight of the removed Gaussians from which a photo shows the object
-    some_weight: Share = 0.1  # and from which it may show some of it
-    rim: int = 1  # px by which the object is larger in the photo than in the splats
-    observed: Share = 0.5  # share of a Gaussian's weight that photos must show
-    shown: float = 0.5  # px of blend weight below which a Gaussian draws nothing
-    solid: Share = 0.5  # alpha below which the scene has no surface
-    low: float = 0.1  # diagonals above the surface up to which a rest of the object may stand
-    margin: int = 1  # px by which a target grows within what the object hides
+    object_weight: Share = 0.25  # blend weight of the object in a pixel that shows it; rests left against more to fill
+    observed: Share = 0.5  # share of a Gaussian's weight that photos must show; haze left against true surface lost
 
 
 def object_pixels(
@@ -41,17 +43,15 @@ def object_pixels(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Where each photo shows the object, and where it may show some of it, [H, W] bool each."""
     gone = scene.take(removed)
-    kernel = np.ones((2 * settings.rim + 1,) * 2, np.uint8)
 
     def of(view: ViewMasks) -> tuple[np.ndarray, np.ndarray]:
         window = window_mask(touched_window(gone, view.camera), view.camera)
         weight = footprint(scene, view.camera, removed, pixels=window)
         shown, some = (
-            # specks are splats of the floor that went along
-            cv2.morphologyEx((weight > least).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-            for least in (settings.object_weight, settings.some_weight)
+            dilated(cv2.morphologyEx((weight > least).astype(np.uint8), cv2.MORPH_OPEN, np.ones((SPECK, SPECK))), RIM)
+            for least in (settings.object_weight, SOME_WEIGHT)
         )
-        return cv2.dilate(shown, kernel) > 0, cv2.dilate(some, kernel) > 0
+        return shown, some
 
     return parallel_map(of, views)
 
@@ -70,12 +70,7 @@ def observed_share(
         labels = np.where(witness.hidden, OBJECT, ELSE).astype(np.uint8)
         return label_weights(kept, view.camera, labels, ELSE, rows)
 
-    total = np.zeros((2, len(kept)))
-    pairs = list(zip(views, witnesses))
-    for start in range(0, len(pairs), 8):  # few results at a time are in memory
-        for part in parallel_map(of, pairs[start : start + 8]):
-            total += part
-    hidden, seen = total
+    hidden, seen = total_over(list(zip(views, witnesses)), of, (2, len(kept)))
     return np.where(rows, seen / np.maximum(seen + hidden, 1e-9), 1.0), np.where(rows, hidden, 0.0)
 
 
@@ -94,7 +89,7 @@ def clear_air(
     kept = scene.take(stays)
     near = near_region(scene, region, 1.0)[stays]
     share, hidden = observed_share(kept, near, views, witnesses)
-    haze = near & kept.usable & (share < settings.observed) & (hidden > settings.shown)
+    haze = near & kept.usable & (share < settings.observed) & (hidden > HAZE_WEIGHT)
     candidates = np.flatnonzero(haze)
     said = ask(witnesses, kept.means[candidates].astype(np.float64), tolerance)
     vouched = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
@@ -104,7 +99,7 @@ def clear_air(
     means = scene.means[rows].astype(np.float64)
     for chart in charts:
         rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        low = np.abs(chart.plane.local(means)[:, 2]) < settings.low * extent(region)
+        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
         fates[rows[rest & low]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
@@ -133,14 +128,13 @@ def chart_targets(
     """
     removed = selection.removed
     gone = scene.take(removed)
-    kernel = np.ones((3, 3), np.uint8)
 
     def of(k: int) -> tuple[ViewMasks, Hits]:
         view, hidden = views[k], witnesses[k].hidden
-        window = window_mask(touched_window(gone, view.camera, 24), view.camera) | hidden
+        window = window_mask(touched_window(gone, view.camera, REACH), view.camera) | hidden
         drawn = drawing(scene, view.camera, with_colour=False, pixels=window)
         depth, alpha = drawn.surface_depth(gone=removed)
-        touched = drawn.footprint(removed) > 0.05
+        touched = drawn.footprint(removed) > TOUCHED
         depth_after = np.where(window, depth, view.depth_before)
         alpha_after = np.where(window, alpha, view.alpha_before)
         hits = first_hits(charts, view.camera, window)
@@ -149,12 +143,11 @@ def chart_targets(
             there = hits.chart == number
             unseen[there] = (chart.hole | chart.below)[hits.rows[there], hits.cols[there]]
         met = hits.depth > 0
-        bare = met & (alpha_after < settings.solid)
-        before = (alpha_after >= settings.solid) & (depth_after > 0) & (depth_after < (1 - tolerance) * hits.depth)
+        bare = met & (alpha_after < SURFACE)
+        before = (alpha_after >= SURFACE) & hits.behind(depth_after, tolerance)
         gone_from = hidden | touched
-        target = (hidden & unseen & ~before) | (gone_from & bare & (view.alpha_before >= settings.solid))
-        target = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
-        target = cv2.dilate(target, kernel, iterations=settings.margin) > 0
+        target = (hidden & unseen & ~before) | (gone_from & bare & (view.alpha_before >= SURFACE))
+        target = dilated(cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3))), RIM)
         target &= met & ~before & gone_from & ~view.occluder
         return replace(
             view,

@@ -11,30 +11,30 @@ import numpy as np
 
 from ..compute.threads import parallel_map
 from ..gaussians import SH_C0, Gaussians
-from ..geometry import window_round
-from ..raster import PixelRegion, Window, label_weights, pixel_region
+from ..geometry import Window, dilated, window_round
+from ..raster import label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
-from .charts import Hits, first_hits
+from .charts.find import TOLERANCE
+from .charts.hits import Hits, first_hits
 from .ground import Ground
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow
-from .witness import Witness
+from .witness import Witness, total_over
 
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
-SAME = 0.05  # relative z up to which what is drawn nearer than an unknown ground is still that ground
-UNRELIABLE = 0.1  # share of the ground that is drawn that much nearer, from which depths tell nothing
-MIXED = 0.75  # the same right beside the object, whose own colours, in the same pixels, would be lifted too
+UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
+MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
 BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
 COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
 LOOKS = 12  # views by which colours are corrected
-CORRECTIONS, HOLD = 3, 3.0  # steps, and px of blend weight by which lifted colours are held, which are nearly right
-UNMIRRORING, LOOSE = 10, 0.03  # the same for those of a reflection, which are quite others
+CORRECTIONS, HOLD = 3, 3.0  # steps of least squares, and px of blend weight by which lifted colours are held
+UNMIRRORING, LOOSE = 10, 0.03  # the same where a reflection goes: colours without it are farther from the old ones
 SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 
 
@@ -135,7 +135,7 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     camera, depth = witness.camera, witness.depth
     hits = first_hits(shadow.grounds, camera, depth > 0)
     on = np.where(_shows(witness, shadow.grounds, hits), hits.chart, -1).astype(int)
-    below = (on < 0) & (hits.depth > 0) & (depth > (1 + SAME) * hits.depth)  # drawn where nothing can be seen
+    below = (on < 0) & (hits.depth > 0) & (depth > (1 + TOLERANCE) * hits.depth)  # drawn where nothing can be seen
     depth = np.where(below | (witness.hidden & (on < 0)), 0, np.where(on >= 0, hits.depth, depth))
     points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64))
     out = np.ones((*depth.shape, 3), np.float32)
@@ -179,7 +179,7 @@ def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarra
     weight = known.astype(np.float32)
     off = cv2.absdiff(expected, witness.photo).max(-1) * weight
     off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)
-    before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
+    before = hits.behind(witness.depth, TOLERANCE)
     proven = known & (off < ALIKE) & (hits.depth > 0)
     rough = proven.any() and before[proven].mean() > UNRELIABLE  # what is drawn before it says nothing here
     is_it = np.where(known, proven, ~before | (hole & (rough | _mixed(witness)))) & (hits.depth > 0)
@@ -188,7 +188,7 @@ def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarra
 
 def _mixed(witness: Witness) -> np.ndarray:
     """[H, W] bool: right beside the object, where colours and depths may be the object's own."""
-    return cv2.dilate((witness.hidden | witness.beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return dilated(witness.hidden | witness.beside, 2)
 
 
 def _brighter(
@@ -202,7 +202,7 @@ def _brighter(
     stays = np.flatnonzero(~removed)
     kept = scene.take(stays)
 
-    def of(pair: tuple[Witness, Arriving]) -> tuple[np.ndarray, np.ndarray] | None:
+    def of(pair: tuple[Witness, Arriving]) -> np.ndarray | None:
         witness, arriving = pair
         dim = np.zeros(witness.hidden.shape, np.float32)
         logs = np.zeros((*dim.shape, 3), np.float32)
@@ -218,16 +218,10 @@ def _brighter(
         level = np.stack([np.bincount(labels.ravel(), logs[..., k].ravel(), BINS + 2) for k in range(3)], 1)
         level = (level / np.maximum(count, 1)[:, None])[1:]
         weights = label_weights(kept, camera, labels, BINS + 1)
-        return weights.sum(0), weights.T @ level.astype(np.float32)
+        return np.column_stack([weights.sum(0), weights.T @ level.astype(np.float32)])
 
-    total, dimmed = np.zeros(len(kept)), np.zeros((len(kept), 3))
-    pairs = list(zip(witnesses, arriving))
-    for start in range(0, len(pairs), 8):  # few results at a time are in memory
-        for part in parallel_map(of, pairs[start : start + 8]):
-            if part is not None:
-                total += part[0]
-                dimmed += part[1]
-    light = np.exp(dimmed / np.maximum(total, 1e-9)[:, None])
+    total, *dimmed = total_over(list(zip(witnesses, arriving)), of, (len(kept), 4)).T
+    light = np.exp(np.stack(dimmed, 1) / np.maximum(total, 1e-9)[:, None])
     rows = np.flatnonzero((COARSER**2 * total > SHOWN) & (light.min(1) < UNTOUCHED))
     sh = kept.sh[rows].astype(np.float64)
     colour = np.clip(0.5 + SH_C0 * sh[:, 0], 0.02, 1.0)
@@ -265,7 +259,8 @@ def _matched(
     change = np.zeros((len(rows), bands, 3))
     for _ in range(corrections):
         now = replace(lit, sh=(sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32))
-        steps = parallel_map(_step, [(region, now, mask, photos[k]) for region, (k, mask) in zip(regions, looks)])
+        asked = [(region, now, mask, photos[k]) for region, (k, mask) in zip(regions, looks)]
+        steps = parallel_map(lambda of: missing_colours(*of), asked)
         bends = np.tile(hold * np.eye(bands), (len(rows), 1, 1))
         slopes = np.zeros_like(change)
         for (weights, missing), basis, (k, _) in zip(steps, bases, looks):
@@ -275,10 +270,6 @@ def _matched(
             slopes += basis[:, :, None] * here[:, None]
         change = np.linalg.solve(bends, slopes)
     return (sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32)
-
-
-def _step(of: tuple[PixelRegion, Gaussians, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    return missing_colours(*of)
 
 
 def most_shown(wanted: Sequence[np.ndarray]) -> list[int]:
@@ -296,7 +287,7 @@ def bare_photos(
         added = reflection.added(witness.camera)
         changed = (np.abs(added).max(-1) > VISIBLE) & ~witness.hidden
         hits = first_hits(reflection.grounds, witness.camera, changed)
-        before = (witness.depth > 0) & (witness.depth < (1 - SAME) * hits.depth)
+        before = hits.behind(witness.depth, TOLERANCE)
         changed &= (hits.chart == 0) & ~before
         photo, light = witness.photo.copy(), np.full(changed.shape, 255, np.uint8)
         bare = linear(photo[changed]) - added[changed]

@@ -10,26 +10,27 @@ import numpy as np
 
 from ..solvers.lights import Shading, Surface
 from ..srgb import linear
-from .charts import Plane
+from .charts.plane import Plane
 from .ground import Ground
 from .occluder import Occluder
 
 DARK = 2e-3  # of linear light, noise of a photo's
-LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of blocks whose luminance is compared …
-BROAD = (8, 16)  # … and of whole ones to tell how strong lights are: finer ones see edges, which no cast meets exactly
+LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of the blocks whose luminance is compared
+BROAD = (8, 16)  # texels of whole grounds: sides of the blocks that tell strengths; no cast meets finer edges exactly
 DIRECTIONS = 384  # about 8° apart
 LOWEST = 8.0  # degrees above the support: light that comes from lower down is no light's
-SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried …
-ROUND = (384, 160, 32)  # … and how many of each
+SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried
+LOBES = (384, 160, 32)  # directions in which lobes of each softness are tried
+SOFT_RANGE = (0.5, 45.0)  # degrees between which softness is settled
 SAMPLES = 48  # rays to a light
 SKY = 96  # and to the sky
 MOST = 3  # lights
-COARSEST, FINEST = 4.0, 1.0  # degrees, steps by which they are settled …
-MOST_ROUNDS = 8  # … each so often at most
-ELSEWHERE = 8  # places of the object that it might as well have …
-ASIDE = 1.1  # … so many of its widths away
-EARNS = 1.3  # times what chance explains, that a light must explain …
-FITS = 0.52  # … and the share of what is uneven where its shadow falls
+COARSEST, FINEST = 4.0, 1.0  # degrees, first and last step by which lights are settled
+MOST_ROUNDS = 8  # of settling by each step
+ELSEWHERE = 8  # other places of the object, which tell what chance explains
+ASIDE = 1.1  # widths of the object from its place to those
+EARNS = 1.3  # times what chance explains that a light must explain
+FITS = 0.52  # share of what is uneven where its shadow falls that a light must explain
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 FAINT = 0.03  # share of light below which nothing is a shadow
 
@@ -49,7 +50,7 @@ class Light:
 
     def direction(self, plane: Plane) -> np.ndarray:
         """[3] unit, scene coordinates, towards the light."""
-        return self.towards @ np.stack([plane.right, plane.down, plane.normal])
+        return self.towards @ plane.axes
 
     def azimuth(self, plane: Plane) -> float:
         """Degrees from the scene's x axis towards y (where the support is level in z; y to z, or z to x, else)."""
@@ -126,7 +127,7 @@ class _Sky:
     def make(cls) -> _Sky:
         rays = _hemisphere(DIRECTIONS)
         lobes, towards, softness = [], [], []
-        for width, count in zip(SOFTNESS, ROUND):
+        for width, count in zip(SOFTNESS, LOBES):
             middle = _hemisphere(count)
             apart = np.degrees(np.arccos(np.clip(rays @ middle.T, -1, 1)))
             lobe = np.exp(-0.5 * (apart / width) ** 2)
@@ -137,12 +138,11 @@ class _Sky:
 
     def cast(self, occluder: Occluder, receivers: Sequence[Receiver]) -> np.ndarray:
         """[T, A] float32: the share of each lobe that the object keeps from every texel."""
-        return np.concatenate(
-            [
-                (occluder.blocked(r.points, self.rays) * _faces(occluder.plane, r.normal, self.rays)) @ self.lobes
-                for r in receivers
-            ]
-        )
+
+        def of(r: Receiver) -> np.ndarray:
+            return occluder.blocked(r.points, self.rays) * _faces(occluder.plane, r.normal, self.rays)
+
+        return np.concatenate([of(r) @ self.lobes for r in receivers])
 
 
 @dataclass(frozen=True)
@@ -236,15 +236,16 @@ def search(scenery: Scenery) -> tuple[list[Light], Told]:
     settled = False
     while True:
         told = scenery.told(lights, bright)
-        worst = min(range(len(lights)), key=lambda k: told[k].enough if settled else told[k].over_chance)
-        if told[worst].enough >= 1 if settled else told[worst].over_chance >= 1:
+        scores = [t.enough if settled else t.over_chance for t in told]
+        worst = int(np.argmin(scores))
+        if scores[worst] >= 1:
             if settled:
                 return lights, told[worst]
-            lights, settled = scenery.settled(lights, [], COARSEST / 2), True
-            continue
-        if len(lights) == 1:
+            settled = True
+        elif len(lights) == 1:
             return [], told[0]
-        lights.pop(worst)
+        else:
+            lights.pop(worst)
         if settled:
             lights = scenery.settled(lights, [], COARSEST / 2)
 
@@ -265,10 +266,8 @@ def _near(light: Light, step: float) -> list[Light]:
         if towards[2] > math.sin(math.radians(LOWEST)):
             found.append(replace(light, towards=towards))
     factor = 1 + step / 8
-    return [
-        *found,
-        *(replace(light, softness=float(np.clip(light.softness * f, 0.5, 45.0))) for f in (factor, 1 / factor)),
-    ]
+    softer = (np.clip(light.softness * f, *SOFT_RANGE) for f in (factor, 1 / factor))
+    return [*found, *(replace(light, softness=float(s)) for s in softer)]
 
 
 def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, light: Light) -> np.ndarray:
@@ -278,19 +277,14 @@ def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, lig
     blocked = occluder.blocked(points, rays)
     facing = np.ones(len(rays)) if normal is None else _faces(occluder.plane, normal, rays)
     if not math.isfinite(light.softness):
-        up = rays[:, 2] if normal is None else rays @ _turned(occluder.plane, normal)
+        up = rays[:, 2] if normal is None else rays @ (occluder.plane.axes @ normal)
         facing = facing * np.maximum(up, 0) / max(float(np.maximum(up, 0).mean()), 1e-6)
     return blocked @ (facing / len(rays)).astype(np.float32)
 
 
 def _faces(plane: Plane, normal: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """[D]: a wall gets no light from behind."""
-    return (rays @ _turned(plane, normal) > 0.02).astype(np.float32)
-
-
-def _turned(plane: Plane, direction: np.ndarray) -> np.ndarray:
-    """[3] in the plane's axes."""
-    return np.stack([plane.right, plane.down, plane.normal]) @ direction
+    return (rays @ (plane.axes @ normal) > 0.02).astype(np.float32)
 
 
 def _across(towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

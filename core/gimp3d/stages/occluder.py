@@ -11,7 +11,7 @@ from scipy.stats import norm, qmc
 from ..compute.jit import kernel
 from ..compute.threads import run_ranges
 from ..gaussians import Gaussians, quats_to_matrices
-from .charts import Plane
+from .charts.plane import Plane
 
 CELLS = 40  # along the longest side
 SAMPLES = 16  # of every Gaussian, by which it is spread over cells
@@ -49,10 +49,9 @@ class Occluder:
             return None
         scales = -np.sort(-g.scales, axis=1).astype(np.float64)
         means = plane.local(g.means.astype(np.float64))
-        frame = np.stack([plane.right, plane.down, plane.normal])
         own = g.scales.astype(np.float64)
         own = np.concatenate([own, np.zeros((len(g), 3 - own.shape[1]))], axis=1)
-        axes = frame @ quats_to_matrices(g.quats.astype(np.float64)) * own[:, None]
+        axes = plane.axes @ quats_to_matrices(g.quats.astype(np.float64)) * own[:, None]
         normal = norm.ppf((qmc.Sobol(3, scramble=False).random(SAMPLES) + 0.5 / SAMPLES) % 1)
         points = means[:, None] + np.einsum("nij,sj->nsi", axes, normal)
         low, high = np.percentile(means, 0.5, axis=0), np.percentile(means, 99.5, axis=0)

@@ -15,9 +15,10 @@ from ..box import Region
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import colours_at
 from ..raster import render
 from ..srgb import decoded, linear
-from .charts import Plane, extent
+from .charts.plane import Plane, extent
 from .ground import ROUGH, Ground
 from .light_search import EARNS, FITS, places_elsewhere
 from .occluder import standing
@@ -108,9 +109,9 @@ def _sampled(
     camera = witness.camera.scaled(1 / max(1.0, pixels))
     photo = cv2.resize(linear(witness.photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     size = camera.width / witness.camera.width, camera.height / witness.camera.height
-    x, y = (np.nan_to_num(uv, nan=-1e4) * size - 0.5).astype(np.float32).T[:, :, None]
-    alpha, light = image(camera)
-    return tuple(cv2.remap(p.astype(np.float32), x, y, cv2.INTER_LINEAR)[:, 0] for p in (photo, alpha, light))
+    at = np.nan_to_num(uv, nan=-1e4) * size
+    found = [colours_at(p.astype(np.float32), at) for p in (photo, *image(camera))]
+    return found[0], found[1], found[2]
 
 
 @dataclass(frozen=True)

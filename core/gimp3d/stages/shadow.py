@@ -14,8 +14,9 @@ import scipy.ndimage
 
 from ..box import Region
 from ..gaussians import Gaussians
+from ..geometry import colours_at, dilated
 from ..solvers.lights import Shading
-from .charts import Plane, extent
+from .charts.plane import Plane, extent
 from .ground import FEWEST, ROUGH, Ground
 from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
 from .occluder import Occluder
@@ -50,9 +51,7 @@ class Shadow:
         if ground >= 0:
             taken, (h, w) = self.taken[ground], self.grounds[ground].known.shape
             uv, _ = self.grounds[ground].camera.project(points)
-            at = uv * [taken.shape[1] / w, taken.shape[0] / h] - 0.5
-            x, y = at.astype(np.float32).T[:, :, None]
-            return 1 - cv2.remap(taken, x, y, cv2.INTER_LINEAR)[:, 0].astype(np.float64)
+            return 1 - colours_at(taken, uv * [taken.shape[1] / w, taken.shape[0] / h]).astype(np.float64)
         light = np.ones((len(points), 3))
         if self.occluder is not None:
             uv, _ = self.grounds[0].camera.project(points)
@@ -193,7 +192,6 @@ def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Se
     marked = ((2 * votes > voters) & (voters > 0)).reshape(ground.known.shape).astype(np.float32)
     # what the object hides lies in its shadow, or the edge of the mask beside it would be one of light
     hole = ((said == Says.HIDDEN).any(0) & (voters == 0)).reshape(ground.known.shape)
-    near = cv2.dilate(marked, np.ones((5, 5), np.uint8)) > 0
     labels, _ = scipy.ndimage.label(hole)
-    marked[np.isin(labels, np.unique(labels[hole & near]))] = 1.0
+    marked[np.isin(labels, np.unique(labels[hole & dilated(marked > 0, 2)]))] = 1.0
     return np.stack([cv2.GaussianBlur(marked, (0, 0), sigma) for sigma in EDGES], -1)

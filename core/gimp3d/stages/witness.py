@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -12,12 +13,14 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel, kernel
 from ..compute.threads import parallel_map, run_ranges
-from ..geometry import cropped
-from ..raster import Window
+from ..geometry import Window, cropped, pack_camera, project
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUD = 127  # grey levels beyond which a difference counts no more; kept as int8
+AT_ONCE = 8  # views whose results are in memory together
 AGREEING = 3  # photos that must show a point for their agreement to be asked
+
+T = TypeVar("T")
 
 
 class Says(IntEnum):
@@ -49,12 +52,6 @@ class Witness:
         return Witness(cropped(self.camera, window), *maps)
 
 
-def pack(camera: Camera) -> np.ndarray:
-    """[18] float64 for kernels: rotation, translation, fx, fy, cx, cy, width, height."""
-    c = camera
-    return np.concatenate([c.R.ravel(), c.t, [c.fx, c.fy, c.cx, c.cy, c.width, c.height]])
-
-
 def ask(
     witnesses: Sequence[Witness],
     points: np.ndarray,  # [N, 3] scene coordinates
@@ -66,21 +63,28 @@ def ask(
     def of(witness: Witness) -> np.ndarray:
         said = np.zeros(len(points), np.uint8)
         depth = np.ascontiguousarray(witness.depth, np.float32)
-        _ask_range(0, len(points), points, pack(witness.camera), witness.hidden, witness.beside, depth, tolerance, said)
+        _ask_range(
+            0, len(points), points, pack_camera(witness.camera), witness.hidden, witness.beside, depth, tolerance, said
+        )
         return said
 
     return np.array(parallel_map(of, witnesses), np.uint8).reshape(len(witnesses), len(points))
 
 
+def total_over(items: Sequence[T], work: Callable[[T], np.ndarray | None], shape: tuple[int, ...]) -> np.ndarray:
+    """The sum of arrays of a shape that `work` makes of items, such as views; None counts as zeros."""
+    total = np.zeros(shape)
+    for start in range(0, len(items), AT_ONCE):
+        for part in parallel_map(work, items[start : start + AT_ONCE]):
+            if part is not None:
+                total += part
+    return total
+
+
 @exact_kernel
 def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
     for i in range(lo, hi):
-        x, y, w = points[i, 0], points[i, 1], points[i, 2]
-        z = c[6] * x + c[7] * y + c[8] * w + c[11]
-        if not z > 0:
-            continue
-        u = c[12] * (c[0] * x + c[1] * y + c[2] * w + c[9]) / z + c[14]
-        v = c[13] * (c[3] * x + c[4] * y + c[5] * w + c[10]) / z + c[15]
+        u, v, z = project(c, points[i, 0], points[i, 1], points[i, 2])
         if not (0 <= u < c[16] and 0 <= v < c[17]):
             continue
         row, col = int(v), int(u)
@@ -129,7 +133,7 @@ class Textures:
             whole = slice(0, h * shrink), slice(0, w * shrink)
             photo = cv2.resize(witness.photo[whole], (w, h), interpolation=cv2.INTER_AREA)
             hidden = hidden[whole].reshape(h, shrink, w, shrink).any((1, 3))
-            camera = pack(witness.camera)
+            camera = pack_camera(witness.camera)
             camera[12:16] /= shrink
             camera[16:] = w, h
             return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
@@ -165,11 +169,8 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
         count, total, squares = 0, 0.0, 0.0
         for k in range(len(cameras)):
             c = cameras[k]
-            z = c[6] * x + c[7] * y + c[8] * w + c[11]
-            if not z > 0:
-                continue
-            u = c[12] * (c[0] * x + c[1] * y + c[2] * w + c[9]) / z + c[14] - 0.5
-            v = c[13] * (c[3] * x + c[4] * y + c[5] * w + c[10]) / z + c[15] - 0.5
+            u, v, _ = project(c, x, y, w)
+            u, v = u - 0.5, v - 0.5
             width, height = int(c[16]), int(c[17])
             if not (0 <= u < width - 1 and 0 <= v < height - 1):
                 continue
@@ -187,42 +188,3 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
         if count >= least:
             energy[i, 0] = total * total / count
             energy[i, 1] = squares
-
-
-@exact_kernel
-def meet_range(lo, hi, rows, cols, c, m, depth, there, number, chart, met, texel_rows, texel_cols):
-    """Rays of camera c against the surface of camera m, whose z is near constant: fixed-point steps along the ray."""
-    ox = -(c[0] * c[9] + c[3] * c[10] + c[6] * c[11])
-    oy = -(c[1] * c[9] + c[4] * c[10] + c[7] * c[11])
-    oz = -(c[2] * c[9] + c[5] * c[10] + c[8] * c[11])
-    height, width = depth.shape
-    for i in range(lo, hi):
-        a, b = (cols[i] + 0.5 - c[14]) / c[12], (rows[i] + 0.5 - c[15]) / c[13]
-        dx = c[0] * a + c[3] * b + c[6]
-        dy = c[1] * a + c[4] * b + c[7]
-        dz = c[2] * a + c[5] * b + c[8]
-        speed = m[6] * dx + m[7] * dy + m[8] * dz
-        start = m[6] * ox + m[7] * oy + m[8] * oz + m[11]
-        if not speed > 1e-9:
-            continue
-        z, row, col, inside = depth[height // 2, width // 2] * 1.0, 0, 0, False
-        for _ in range(12):
-            t = (z - start) / speed
-            x, y, w = ox + t * dx, oy + t * dy, oz + t * dz
-            front = m[6] * x + m[7] * y + m[8] * w + m[11]
-            u = m[12] * (m[0] * x + m[1] * y + m[2] * w + m[9]) / front + m[14]
-            v = m[13] * (m[3] * x + m[4] * y + m[5] * w + m[10]) / front + m[15]
-            inside = 0 <= u < width and 0 <= v < height
-            if not inside:
-                break
-            row, col = int(v), int(u)
-            if abs(depth[row, col] - z) < 1e-6 * z:
-                break
-            z += 0.7 * (depth[row, col] - z)
-        t = (z - start) / speed
-        if not inside or not t > 0 or not there[row, col]:
-            continue
-        before = met[rows[i], cols[i]]
-        if before == 0 or t < before:
-            chart[rows[i], cols[i]], met[rows[i], cols[i]] = number, t
-            texel_rows[rows[i], cols[i]], texel_cols[rows[i], cols[i]] = row, col

@@ -340,7 +340,9 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     axes = pose[:3, :3]
     plane = Plane(offset * normal, axes[0], axes[1], normal)
     there = np.ones((h, w), bool)
-    return Chart(camera, plane, "plane", depth, there, grey, no.astype(np.uint16), *[no] * 4, 1.0, 0.0, 0.0, 0.01, "")
+    return Chart(
+        plane, camera, depth, there, grey, no, no, "plane", no.astype(np.uint16), no, no, 1.0, 0.0, 0.0, 0.01, ""
+    )
 
 
 def rays_of(camera: Camera) -> np.ndarray:

@@ -10,7 +10,8 @@ import numpy as np
 from light_ablation import Prepared, found_in, made
 from light_scenes import Lamp, make_scene
 
-from gimp3d.stages.lifting import light_in
+from gimp3d.camera import Camera
+from gimp3d.stages.lifting import Arriving, _lifted, light_in
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
 
@@ -40,3 +41,26 @@ def test_what_is_drawn_below_the_ground_is_lifted_nowhere() -> None:
         shaded += int((light(witness) < 0.9)[far].sum())
         strange += int((light(below) < 0.99)[far].sum())
     assert shaded > 1000 and strange < 0.2 * shaded
+
+
+def test_dim_pixels_right_beside_the_object_are_filled_and_not_lifted() -> None:
+    """They hold some of the object's own colours, which would be lifted with the ground's."""
+    camera = Camera("0", 40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    hidden, beside = np.zeros((2, 30, 40), bool)
+    hidden[10:20, 10:20], beside[10:20, 20:22] = True, True
+    witness = Witness(camera, np.full((30, 40, 3), 60, np.uint8), hidden, beside, np.ones((30, 40), np.float32))
+    window = slice(0, 30), slice(0, 40)
+    near = cv2.dilate((hidden | beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    for light, filled in ((0.9, near & False), (0.6, near & ~hidden), (0.2, ~hidden)):
+        photo, shaded, dark, _ = _lifted(witness, Arriving(window, np.full((30, 40, 3), light, np.float32)))
+        np.testing.assert_array_equal(dark, filled)
+        np.testing.assert_array_equal(shaded, ~hidden)
+        assert (photo[shaded] > 60).all() and (photo[hidden] == 60).all()
+
+
+def test_light_is_told_at_more_points_than_opencv_samples_at_once() -> None:
+    shadow = prepared()[1]
+    points = shadow.grounds[0].points().reshape(-1, 3)
+    assert len(points) > 1 << 15
+    parts = [shadow.arriving(p, 0) for p in np.array_split(points, 2)]
+    np.testing.assert_array_equal(shadow.arriving(points, 0), np.concatenate(parts))

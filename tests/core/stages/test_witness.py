@@ -12,8 +12,9 @@ from property_tests import examples
 from scenes import cameras
 
 from gimp3d.camera import Camera
+from gimp3d.geometry import pack_camera
 from gimp3d.orbit import look_at
-from gimp3d.stages.witness import Says, Textures, Witness, ask, pack
+from gimp3d.stages.witness import Says, Textures, Witness, ask
 
 CAMERA = Camera("one", 8, 6, 10.0, 10.0, 4.0, 3.0, np.eye(4))
 
@@ -98,7 +99,7 @@ def test_no_points_and_no_photos_are_answered() -> None:
 
 def test_packed_cameras_hold_the_projection() -> None:
     camera = cameras()[4]
-    c = pack(camera)
+    c = pack_camera(camera)
     point = np.array([0.1, -0.2, 0.3])
     p = c[:9].reshape(3, 3) @ point + c[9:12]
     np.testing.assert_allclose(p[:2] / p[2] * c[12:14] + c[14:16], camera.project(point)[0], rtol=1e-12)
@@ -178,5 +179,5 @@ def test_what_a_photo_hides_does_not_count(plane_photos: list[Witness]) -> None:
 def test_only_so_many_photos_are_compared(plane_photos: list[Witness]) -> None:
     textures = Textures.make(plane_photos, most=4)
     chosen = [plane_photos[k].camera for k in (0, 2, 4, 6)]
-    np.testing.assert_array_equal(textures.cameras, [pack(c) for c in chosen])
+    np.testing.assert_array_equal(textures.cameras, [pack_camera(c) for c in chosen])
     assert len(textures.values) == 4 * 240 * 180

@@ -1,0 +1,277 @@
+"""A chart's picture: what all photos show of a surface with the object left out, and the hole that none shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import scipy.ndimage
+
+from ...box import Region, in_region
+from ...camera import Camera
+from ...compute.threads import parallel_map
+from ...geometry import dilated, framed, sees
+from ..footprint import shows_object
+from ..masks import ViewMasks
+from ..mosaic import mosaic
+from ..witness import Says, Textures, Witness, ask
+from .find import TOLERANCE, ChartSettings, grid
+from .hits import Facing
+from .plane import Plane, extent
+from .surface import TELLING, facing_camera, lay_surface, pixel_size
+
+VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
+UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
+LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
+MIXED = 2  # texels round the object whose pixels show some of it
+SOFT = 8  # texels round a hole that may show some of the object
+MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
+PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
+MARGIN, LEAST_MARGIN = 0.75, 0.15  # of a hole's size, and diagonals: surface round it to fill it from
+SURFACE = 5000  # points of a chart at which drawn depths are compared
+SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
+MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that lie on another surface
+
+
+@dataclass(frozen=True)
+class Chart(Facing):
+    """A surface seen straight on, its object left out; arrays [H, W] of its camera."""
+
+    kind: str  # plane | relief
+    photos: np.ndarray  # uint16, how many show it
+    below: np.ndarray  # bool, known only from what the object's rough mask covers
+    rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
+    agreement: float  # of the photos round the hole, see Textures
+    noise: float  # median distance of the views' drawn surfaces from it, scene units
+    scatter: float  # relative z by which the views' drawn surfaces scatter about it
+    tolerance: float  # the same, but never very small: within it a drawn surface is this one
+    reason: str
+
+
+def draw_charts(
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
+    region: Region,
+    settings: ChartSettings = ChartSettings(),
+    marked: Sequence[np.ndarray] = (),  # [H, W] bool, of the same views: to be filled whatever they show
+) -> tuple[Chart, ...]:
+    """What photos show of the surfaces at the planes; those without a hole are left out."""
+    textures = Textures.make(witnesses)
+    charts: list[Chart] = []
+    for plane in planes:
+        others = [p for p in planes if plane.crosses(p)]
+        chart = _chart(plane, others, region, views, witnesses, marked, textures, settings)
+        if chart is not None:
+            charts.append(chart)
+    bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
+    return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
+
+
+def _bounded(chart: Chart, charts: Sequence[Chart]) -> Chart:
+    """The chart, ended where it goes through another one that all photos show it before: a floor at a wall."""
+    points, there = chart.points().reshape(-1, 3), chart.there
+    shown = there & (chart.photos > 0)
+    for other in charts:
+        if chart.plane.crosses(other.plane):
+            behind = (other.plane.local(points)[:, 2] < 0).reshape(there.shape)
+            if shown.any() and behind[shown].mean() < MEETING:
+                there = there & ~behind
+    return replace(chart, there=there, hole=chart.hole & there)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What photos show of a surface, as far as the object's masks tell; arrays [H, W]."""
+
+    there: np.ndarray  # bool
+    image: np.ndarray  # [H, W, 3] uint8; in the hole it is what they show below the masks
+    photos: np.ndarray  # uint16, how many show it
+    hiding: np.ndarray  # uint16, in how many the object's mask covers it
+    known: np.ndarray  # bool
+    hole: np.ndarray  # bool
+    alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
+
+
+def _chart(
+    plane: Plane,
+    others: Sequence[Plane],  # that it may meet
+    region: Region,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    marked: Sequence[np.ndarray],
+    textures: Textures,
+    settings: ChartSettings,
+) -> Chart | None:
+    """The chart at a plane; None if the object hides nothing of it, or no view faces what it hides."""
+    placed = _placed(plane, region, views, witnesses, settings)
+    if placed is None:
+        return None
+    camera, away = placed
+    surface = lay_surface(camera, away, plane, region, views, witnesses, textures, settings)
+    scatter = _scatter(surface.texels, others, witnesses)
+    tolerance = max(TOLERANCE, scatter)
+    shown = _shown(surface.points, plane, witnesses, tolerance)
+    below, rests = _told_by_colours(
+        shown,
+        _object_colours(plane, witnesses, tolerance),
+        in_region(region, surface.texels).reshape(surface.depth.shape),
+        _marked(surface.texels, witnesses, marked, surface.depth.shape),
+    )
+    hole = (shown.hole & ~below) | rests
+    return Chart(
+        plane,
+        camera,
+        surface.depth,
+        shown.there,
+        image=np.where(hole[..., None], np.uint8(0), shown.image),
+        known=(shown.known | below) & ~hole,
+        hole=hole,
+        kind=surface.kind,
+        photos=np.where(below, shown.hiding, shown.photos),
+        below=below,
+        rests=rests,
+        agreement=surface.agreement,
+        noise=surface.noise,
+        scatter=scatter,
+        tolerance=tolerance,
+        reason=surface.reason,
+    )
+
+
+def _placed(
+    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], settings: ChartSettings
+) -> tuple[Camera, float] | None:
+    """The camera that faces what the object hides of a plane and a margin to fill it from, and the plane's z there.
+
+    None if the object hides nothing of it, or no view faces what it hides.
+    """
+    diagonal = extent(region)
+    x, y = grid(2 * diagonal, PLACES)
+    hole = _unseen(ask(witnesses, plane.points(x, y).reshape(-1, 3), TOLERANCE).reshape(-1, *x.shape))
+    labels, _ = scipy.ndimage.label(hole)
+    hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
+    if not hole.any():
+        return None
+    cell = 4 * diagonal / PLACES
+    low, high = (np.array([x[hole], y[hole]]).min(1) - cell, np.array([x[hole], y[hole]]).max(1) + cell)
+    size = high - low
+    size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
+    place = plane.points(*((low + high) / 2)[:, None])[0]
+    texel = pixel_size(place, plane.normal, views)
+    if not math.isfinite(texel):
+        return None
+    return facing_camera(plane, place, size, max(texel, float(size.max()) / settings.largest))
+
+
+def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
+    """What photos show at points [H, W, 3] of a surface."""
+    said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
+    there = shown_there(said)
+    hole = _unseen(said) & there
+    image, spread = mosaic(points, plane.normal, witnesses, said)
+    photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
+    limit = usual_spread(spread[there & (photos > 1) & ~hole])
+    alike = spread <= limit
+    # few photos claim to show what the object hides from most, and they do not agree: they show something before it
+    hole |= there & (photos > 0) & ~alike & (hiding > photos)
+    beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
+    below, spread_below = mosaic(points, plane.normal, witnesses, beneath)
+    known = alike & there & (photos > 1) & ~hole
+    image = np.where(hole[..., None], below, image)
+    return _Shown(there, image, photos, hiding, known, hole, spread_below <= limit)
+
+
+def _told_by_colours(
+    shown: _Shown,
+    object_colours: np.ndarray,  # [N, 3] uint8
+    inside: np.ndarray,  # [H, W] bool, texels in the region
+    marked: np.ndarray,  # [H, W] bool, texels that are filled whatever photos show
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there.
+
+    Where photos agree below it, and on the surface's colours, they show the surface.
+    """
+    s = shown
+    far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
+    doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
+    around = s.known & ~doubtful & (far < math.sqrt(s.hole.sum()))
+    object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
+    below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
+    below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
+    return below, object_ & (s.photos > 0)
+
+
+def usual_spread(spread: np.ndarray) -> float:
+    """By how much photos' textures may differ and still show the surface: else they show what stands on it.
+
+    A quarter of what several photos show is taken for the surface itself.
+    """
+    return max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread, 25))) if len(spread) else LEAST_SPREAD
+
+
+def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> np.ndarray:
+    """[N, 3] uint8: what photos show of the object where it is clearly nearer than the plane."""
+
+    def of(witness: Witness) -> np.ndarray:
+        c = witness.camera
+        rays = c.unproject(c.pixel_centres(), np.ones(witness.hidden.shape)) - c.centre
+        with np.errstate(divide="ignore"):
+            z = ((plane.origin - c.centre) @ plane.normal) / (rays @ plane.normal)
+        before = witness.depth < (1 - tolerance) * np.where(z > 0, z, np.inf)
+        return witness.photo[witness.hidden & (witness.depth > 0) & before]
+
+    return np.concatenate(parallel_map(of, witnesses))
+
+
+def _marked(
+    points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
+    """[H, W] bool: texels at points [H·W, 3] that the user marked in some view."""
+    found = np.zeros(len(points), bool)
+    for witness, mask in zip(witnesses, marked):
+        if mask.any():
+            found |= sees(witness.camera, mask.astype(np.float32), points, np.inf)
+    return found.reshape(shape)
+
+
+def _scatter(
+    surface: np.ndarray,  # [N, 3]
+    others: Sequence[Plane],  # that it may meet
+    witnesses: Sequence[Witness],
+) -> float:
+    """How far, relative to z, the views' drawn surfaces scatter about this one: three standard deviations."""
+    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
+    # what lies behind a wall says nothing of how the floor's depths scatter
+    surface = surface[before] if before.sum() > TELLING else surface
+    some, off = surface[:: max(1, len(surface) // SURFACE)], [np.zeros(0)]
+    for witness in witnesses:
+        _, rows, cols, z = framed(witness.camera, some)
+        front = witness.depth[rows, cols]
+        shown = ~witness.hidden[rows, cols] & (front > 0)
+        off.append(front[shown] / z[shown] - 1)
+    found = np.abs(np.concatenate(off))
+    return min(SCATTER * float(np.median(found)), MOST_SCATTER) if len(found) else 0.0
+
+
+def _unseen(said: np.ndarray) -> np.ndarray:
+    """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
+    seen = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).sum(0)
+    hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
+    return (seen == 0) & (hidden > behind)
+
+
+def shown_there(said: np.ndarray) -> np.ndarray:
+    """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so nearest."""
+    seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
+    through = (said == Says.THROUGH).sum(0)
+    known = seen + through > 0
+    if not known.any():
+        return np.ones(known.shape, bool)
+    # single texels beside the object's foot err; edges of tables are long
+    votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
+    rows, cols = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return (np.where(known, votes, 0) >= 0)[rows, cols]

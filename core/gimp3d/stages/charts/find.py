@@ -1,0 +1,188 @@
+"""The planes that run into what the object hid: sought among drawn depths, settled where photos agree on them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+from ...box import Region, in_region
+from ...compute.threads import parallel_map
+from ...geometry import SOLID, surface_points
+from ...schema import AtLeastOne, Share
+from ..masks import ViewMasks
+from ..witness import Says, Textures, Witness, ask
+from .plane import Plane, extent, largest_plane
+
+TOLERANCE = 0.05  # relative z by which a view's surface must be nearer to hide a point: rough scans scatter by 3 to 9 %
+MIXED_RIM = 2.0  # px beside the object whose depths may be its own
+RING = 24.0  # px round the object from which surface is gathered
+GATHERED = 100_000  # points of surface at most, of all views
+HIDDEN = 0.15  # share of the views by which the object hides a point of surface that tells of what it hid
+INLIER = 0.03  # diagonals of the region up to which such a point lies on a plane
+MOST = 4  # planes that are tried: a floor, two walls, and one that rough depths make up
+RIVAL = 1.1  # how much better photos must agree on a further plane than on those before it, for the points on it
+LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
+POINTS = 96  # along a side, at which photos are compared at the finest level
+SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sought, and offsets that are tried
+TILT = 0.2  # slope by which it is tilted to begin with: rough depths were 8° off (kitchen_monkey)
+TRIED = 3  # planes of the coarsest level that are followed up
+STEP, COARSE_STEP, FINE_STEP = 0.01, 0.0025, 1e-4  # the pattern search's first and last ones: offset in diagonals
+
+
+@dataclass(frozen=True)
+class ChartSettings:
+    """How surfaces are found and shown."""
+
+    least: float = 0.1  # share of the points round the object; fewer planes against missed ones
+    relief: Share = 0.9  # share of what photos disagree on, on the plane; rather planes, or rather reliefs
+    largest: AtLeastOne = 900  # px, side of a chart at most; detail against time
+
+
+@dataclass(frozen=True)
+class _Round:
+    """Surface that the views show round the object."""
+
+    points: np.ndarray  # [N, 3]
+    eyes: np.ndarray  # [N, 3] where the view stood that shows it
+    weight: np.ndarray  # [N], how much it tells of what the object hid
+
+    def take(self, rows: np.ndarray) -> _Round:
+        return _Round(self.points[rows], self.eyes[rows], self.weight[rows])
+
+    def on(self, plane: Plane) -> np.ndarray:
+        """[N, 3]: where the same rays meet a plane."""
+        rays = self.points - self.eyes
+        along = rays @ plane.normal
+        reach = ((plane.origin - self.eyes) @ plane.normal) / np.where(np.abs(along) > 1e-12, along, np.nan)
+        return self.eyes + np.where(reach > 0, reach, np.nan)[:, None] * rays
+
+
+def surface_depth_beside(view: ViewMasks, witness: Witness) -> np.ndarray:
+    """[H, W] z of the solid surfaces that a view shows beside the object; 0 elsewhere."""
+    return np.where(witness.hidden | (view.alpha_before < SOLID) | view.occluder, 0, view.depth_before)
+
+
+def surface_beside(
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    most: int,  # points, about
+    within: tuple[float, float] = (0.0, math.inf),  # px from the object
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [N, 3] of the solid surfaces that views show beside the object, and where each view stands [N, 3]."""
+
+    def of(view: ViewMasks, witness: Witness) -> tuple[np.ndarray, np.ndarray]:
+        far = cv2.distanceTransform((~witness.hidden).astype(np.uint8), cv2.DIST_L2, 5)
+        depth = np.where((far > within[0]) & (far <= within[1]), surface_depth_beside(view, witness), 0)
+        step = max(1, round(math.sqrt((depth > 0).sum() * len(views) / most)))
+        points = surface_points(view.camera, depth, step=step)[2]
+        return points, np.broadcast_to(view.camera.centre, points.shape)
+
+    parts = parallel_map(lambda p: of(*p), list(zip(views, witnesses)))
+    points, eyes = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+    return points, eyes
+
+
+def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> _Round:
+    points, eyes = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
+    outside = ~in_region(region, points)
+    points, eyes = points[outside], eyes[outside]
+    said = ask(witnesses, points, TOLERANCE)
+    share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
+    near = share > HIDDEN
+    return _Round(points[near], eyes[near], share[near] ** 2)
+
+
+def find_planes(
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
+    region: Region,
+    settings: ChartSettings = ChartSettings(),
+) -> tuple[Plane, ...]:
+    """The planes nearest to the surfaces that run into what the object hid.
+
+    Planes are sought among the points of surface round the object, each counting by the square of the share of views
+    in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
+    photos' textures agree best, since the depths of rough splats do not tell; and of two planes that could both be
+    what some pixels show, photos choose as well.
+    """
+    diagonal = extent(region)
+    around = _surface_round(views, witnesses, region)
+    levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
+    textures = levels[-1]
+    cameras = np.array([v.camera.centre for v in views])
+    rng, left = np.random.default_rng(0), around
+    found: list[tuple[Plane, _Round]] = []
+    while len(found) < MOST:
+        candidate = largest_plane(left.points, left.weight, INLIER * diagonal, cameras, region, rng)
+        if candidate is None or left.weight[candidate[1]].sum() < settings.least * around.weight.sum():
+            break
+        plane, on = candidate
+        found.append((_settled(plane, diagonal, levels), left.take(on)))
+        left = left.take(~on)
+    found.sort(key=lambda f: -textures.agreement(around.on(f[0])))
+    planes: list[Plane] = []
+    for plane, own in found:
+        before = max((textures.agreement(own.on(p)) for p in planes), default=-math.inf)
+        if textures.agreement(own.on(plane)) >= RIVAL * before:
+            planes.append(plane)
+    return tuple(planes)
+
+
+def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places on a square, [count, count] each."""
+    side = ((np.arange(count) + 0.5) / count * 2 - 1) * half
+    x, y = np.meshgrid(side, side)
+    return x, y
+
+
+def _settled(plane: Plane, half: float, levels: Sequence[Textures]) -> Plane:
+    """The plane where photos agree best (plane sweep, then a pattern search with tilts: Hooke 1961), coarse to fine.
+
+    Coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a compromise of
+    several surfaces: the fine level also starts from a sweep of its own.
+    """
+    sweep, tilts = np.linspace(-1, 1, SWEEP) * SEARCH, (-TILT, 0.0, TILT)
+    starts = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
+    for level, textures in enumerate(levels):
+        finest = level == len(levels) - 1
+        x, y = grid(half, POINTS // 2 ** (len(levels) - 1 - level))
+        agreement = partial(_agreement_at, plane, half, x, y, textures)
+        if level == 0:
+            starts = _best_of(agreement, starts, TRIED)
+        if finest:
+            starts = [*starts, *_best_of(agreement, [np.array([o, 0.0, 0.0]) for o in sweep], 1)]
+        found = [_climbed(agreement, start, FINE_STEP if finest else COARSE_STEP) for start in starts]
+        starts = [max(found, key=lambda f: f[0])[1]]
+    offset, slope_x, slope_y = starts[0]
+    return plane.tilted(offset * half, slope_x, slope_y)
+
+
+def _agreement_at(plane: Plane, half: float, x: np.ndarray, y: np.ndarray, textures: Textures, at: np.ndarray) -> float:
+    """Of photos on the plane moved and tilted by `at` [3]: offset over `half`, two slopes."""
+    height = at[0] * half + at[1] * x + at[2] * y
+    return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+
+
+def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
+    told = [agreement(s) for s in starts]
+    return [starts[k] for k in np.argsort(told)[::-1][:count]]
+
+
+def _climbed(agreement: Callable[[np.ndarray], float], start: np.ndarray, least: float) -> tuple[float, np.ndarray]:
+    """The greatest value near a start, and where it is: pattern search down to a step."""
+    at, best, step = start, agreement(start), STEP
+    while step > least:
+        moves = [at + step * sign * np.eye(3)[k] * (1 if k == 0 else 2) for k in range(3) for sign in (1, -1)]
+        told = [agreement(m) for m in moves]
+        k = int(np.argmax(told))
+        if told[k] > best:
+            at, best = moves[k], told[k]
+        else:
+            step /= 2
+    return best, at
