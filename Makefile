@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth bench-propagate \
-	bench-harmonics bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension \
-	screenshots by-mouse clean
+.PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
+	bench-ablation bench-propagate bench-harmonics bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
+	bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -20,7 +20,7 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(READY)
-	$(BIN)/python scripts/demo.py
+	$(BIN)/python tools/demo.py
 
 # a file's tests stay together: they share scenes and removals
 SIDE_BY_SIDE := -n 2 --dist loadfile
@@ -32,11 +32,11 @@ test: $(READY)
 test-all: export HYPOTHESIS_PROFILE = thorough
 test-all: $(READY) lint
 	$(BIN)/python -m pytest
-	$(BIN)/python scripts/test_blenders.py
+	$(BIN)/python tools/test_blenders.py
 
 # the add-on's tests under Blender 4.5 LTS and 5.2 LTS
 test-blenders: $(READY)
-	$(BIN)/python scripts/test_blenders.py
+	$(BIN)/python tools/test_blenders.py
 
 # the painters with their optional libraries, ONNX Runtime and Google's client, in an environment of their own
 PAINTERS := build/painters
@@ -54,59 +54,63 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-propagate bench-harmonics bench-nnf bench-inpaint \
-	bench-pareto bench-stability
+bench: bench-raster bench-surface bench-poisson bench-depth bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
-# PROTOTYPE=folder: also against the rasteriser's first prototype
 bench-raster: $(READY)
-	$(BIN)/python scripts/bench_raster.py $(if $(PROTOTYPE),--prototype $(PROTOTYPE))
+	$(BIN)/python -m benchmarks.raster
 
 bench-surface: $(READY)
-	$(BIN)/python scripts/bench_surface.py $(DATA)
+	$(BIN)/python -m benchmarks.surface $(DATA)
 
 bench-poisson: $(READY)
-	$(BIN)/python scripts/bench_poisson.py
+	$(BIN)/python -m benchmarks.poisson
 
 bench-depth: $(READY)
-	$(BIN)/python scripts/bench_depth.py --data $(DATA)
+	$(BIN)/python -m benchmarks.depth $(DATA)
 
+# each rule of a removal switched off in turn: hours, so not part of bench; goes on where it stopped
+bench-ablation: $(READY)
+	$(BIN)/python -m benchmarks.ablation $(DATA)
+
+# those of the way from the reference into the other views
 bench-propagate: $(READY)
-	$(BIN)/python scripts/bench_propagate.py $(DATA)
+	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate --rules "the warp" \
+		retargeting "paper's sampling" "paper's blend" "in the picture"
 
 # 128 removals: an hour, so not part of bench
 bench-references: $(READY)
-	$(BIN)/python scripts/bench_references.py $(DATA)
+	$(BIN)/python -m benchmarks.references $(DATA)
 
 # every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
 bench-real: $(READY)
-	$(BIN)/python scripts/bench_real.py $(DATA)
+	$(BIN)/python -m benchmarks.real $(DATA)
 
 bench-light: $(READY)
-	$(BIN)/python scripts/bench_light.py $(DATA)
+	$(BIN)/python -m benchmarks.light $(DATA)
 
+# one of the rules about the object's light switched off: make bench-light-rules RULE="hue is no paint"
 bench-light-rules: $(READY)
-	$(BIN)/python scripts/light_ablation.py $(DATA)
+	$(BIN)/python -m benchmarks.light $(DATA) --skip-removals --without "$(or $(RULE),a light need not beat chance)"
 
-# with DATA, also what the fit brings to removals: ten minutes more
 bench-harmonics: $(READY)
-	$(BIN)/python scripts/bench_harmonics.py $(if $(wildcard $(DATA)),--data $(DATA))
+	$(BIN)/python -m benchmarks.harmonics
 
 # presets, ablations and baselines: half an hour
 bench-pareto: $(READY)
-	$(BIN)/python scripts/bench_refine.py $(DATA)
+	$(BIN)/python -m benchmarks.pareto $(DATA)
 
 # removals whose input is wrong: ten minutes
 bench-stability: $(READY)
-	$(BIN)/python scripts/bench_stability.py $(DATA)
+	$(BIN)/python -m benchmarks.stability $(DATA)
 
 # desk with every Gaussian split in ten and 200 views of 960 × 540
 bench-large: $(READY)
-	$(BIN)/python scripts/bench_large.py $(DATA)/desk
+	$(BIN)/python -m benchmarks.large $(DATA)/desk
 
 # bad inputs, faults, kills and moved scenes: the table of docs/reliability.md, in less than half an hour
 bench-faults: $(READY)
-	$(BIN)/python scripts/bench_faults.py
+	$(BIN)/python -m benchmarks.faults
 
 # changed files for every reader, guided by coverage where atheris can be installed: hours; goes on where it stopped
 FUZZ := build/fuzz/venv
@@ -119,7 +123,7 @@ $(FUZZ)/.ready: $(READY)
 	@touch $@
 
 fuzz: $(FUZZ)/.ready
-	$(FUZZ)/bin/python scripts/fuzz.py
+	$(FUZZ)/bin/python tools/fuzz.py
 
 # scikit-image's photographs and other programs' fills come from an environment of their own
 OTHERS := build/others
@@ -131,30 +135,33 @@ $(OTHERS)/.ready:
 	@touch $@
 
 bench-nnf: $(READY) $(OTHERS)/.ready
-	$(BIN)/python scripts/bench_nnf.py --others $(OTHERS)/bin/python
+	$(BIN)/python -m benchmarks.nnf --others $(OTHERS)/bin/python
 
 bench-inpaint: $(READY) $(OTHERS)/.ready
-	$(BIN)/python scripts/bench_inpaint.py --others $(OTHERS)/bin/python
+	$(BIN)/python -m benchmarks.fill --only photographs --out build/bench_inpaint --others $(OTHERS)/bin/python
 
 # the built-in fill beside the true picture given, and beside other programs on pictures with structure: ten minutes
 bench-fill: $(READY) $(OTHERS)/.ready
-	$(BIN)/python scripts/bench_fill.py $(DATA) --others $(OTHERS)/bin/python
+	$(BIN)/python -m benchmarks.fill --only pictures --others $(OTHERS)/bin/python
+	$(BIN)/python -m benchmarks.real $(DATA) --presets balanced --out build/bench_fill \
+		--scenes desk,corner,gloss,rocks,real_table,real_bed,kitchen_monkey,tiles_mug
 
+# those of the fill: whole removals without a picture given
 bench-fill-rules: $(READY)
-	$(BIN)/python scripts/fill_ablation.py $(DATA)
+	$(BIN)/python -m benchmarks.ablation $(DATA) --rules regular vote "Telea" --picture built-in --out build/bench_fill_rules
 
 extension: $(READY)
-	$(BIN)/python scripts/build_extension.py
+	$(BIN)/python tools/build_extension.py
 
-# in a real Blender with its window, on a virtual screen: root on Debian, see scripts/screenshots.py
+# in a real Blender with its window, on a virtual screen: root on Debian, see tools/screenshots.py
 screenshots: demo
 	cp build/demo/before_after.png assets/before_after.png
-	$(BIN)/python scripts/screenshots.py
+	$(BIN)/python tools/screenshots.py
 
 # a removal by mouse, by script and by command in a real Blender gives the same bytes: needs what screenshots needs
 by-mouse: $(READY)
-	$(BIN)/python scripts/by_mouse.py
-	$(BIN)/python scripts/by_mouse.py --suite sid
+	$(BIN)/python tools/by_mouse.py
+	$(BIN)/python tools/by_mouse.py --suite sid
 
 clean:
 	rm -rf build dist $(VENV)

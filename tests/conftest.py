@@ -13,7 +13,7 @@ from hypothesis import settings
 os.environ["GIMP3D_STATE"] = tempfile.mkdtemp(prefix="gimp3d-state-")  # records and logs of the tests are nobody's
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))  # light_scenes.py
+sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks
 
 from property_tests import register_profiles
 from scenes import REGION, cameras, scene

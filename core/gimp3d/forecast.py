@@ -1,6 +1,6 @@
 """What a removal will cost, told before it starts, and how far a running one is.
 
-The constants are written by scripts/calibrate_forecast.py, which measures them (2 cores, kernels compiled; the demo
+The constants are written by tools/calibrate_forecast.py, which measures them (2 cores, kernels compiled; the demo
 scene with up to four times the Gaussians and pixels). Who runs removals multiplies by their own last run's pace.
 """
 

@@ -18,7 +18,7 @@ from ..worker import Worker, core_folder, own_python
 from .base import RunsChild, python_of, redraw_panels
 
 LOCK = Path(__file__).resolve().parents[1] / "wheels.txt"  # versions and SHA-256 of the files that are installed
-SIZE = "about 190 MB to download, 650 MB on disk"  # on Linux: scripts/environment_size.py measures it
+SIZE = "about 190 MB to download, 650 MB on disk"  # on Linux: tools/lock_wheels.py --size measures it
 INSTALLED = "gimp3d-installed.json"  # in the environment: pip's report of what it installed
 MAKE = """
 import json, os, subprocess, sys, venv

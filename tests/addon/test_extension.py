@@ -62,7 +62,7 @@ def install_and_run(zip_path: Path, folder: Path, python: Path, environment: dic
 
 
 def build(*arguments: str) -> Path:
-    command = [sys.executable, str(ROOT / "scripts" / "build_extension.py"), "--platform", "here", *arguments]
+    command = [sys.executable, str(ROOT / "tools" / "build_extension.py"), "--platform", "here", *arguments]
     subprocess.run(command, check=True)
     return max((ROOT / "dist").glob("gimp3d-*.zip"), key=lambda p: p.stat().st_mtime)
 

@@ -24,7 +24,7 @@ VASE, FOOT = np.array([0.05, -0.05]), 0.105  # m, where it stands and its foot's
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the script makes: the demo's files and truth.ply."""
     folder = tmp_path_factory.mktemp("demo")
-    script = [sys.executable, str(ROOT / "scripts" / "make_demo_scene.py")]
+    script = [sys.executable, str(ROOT / "tools" / "make_demo_scene.py")]
     subprocess.run([*script, "--folder", str(folder)], check=True)
     subprocess.run([*script, "--without-object", str(folder / "truth.ply")], check=True)
     return folder

@@ -34,7 +34,7 @@ def test_steps_and_charts_are_the_presets_own() -> None:
     ("preset", "seconds", "memory_mb"), [("balanced", 8.1, 501), ("best", 9.6, 502), ("paper", 61.9, 658)]
 )
 def test_the_demo_takes_the_time_that_was_measured(preset: str, seconds: float, memory_mb: float) -> None:
-    """On the machine that the constants come from: what scripts/calibrate_forecast.py printed."""
+    """On the machine that the constants come from: what tools/calibrate_forecast.py printed."""
     told = forecast_removal(44_914, 24, 24 * 480 * 270, preset)
     assert 0.8 < told.seconds / seconds < 1.25 and 0.7 < told.memory_mb / memory_mb < 1.4
 

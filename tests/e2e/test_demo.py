@@ -15,14 +15,14 @@ from gimp3d.pipeline import render_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "assets" / "demo"
-MAKE = [sys.executable, str(ROOT / "scripts" / "make_demo_scene.py")]
+MAKE = [sys.executable, str(ROOT / "tools" / "make_demo_scene.py")]
 
 
 def test_the_demo_removes_the_vase(tmp_path: Path) -> None:
     pytest.importorskip("bpy", reason="the bpy module is not installed (make setup installs it)")
     out = tmp_path / "demo"
     done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "demo.py"), "--out", str(out)],
+        [sys.executable, str(ROOT / "tools" / "demo.py"), "--out", str(out)],
         capture_output=True,
         text=True,
         timeout=600,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from light_scenes import Lamp, make_scene
+from lit_scenes import Lamp, make_scene
 from scenes import floor_colours
 
 from gimp3d.camera import output_name

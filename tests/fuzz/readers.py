@@ -1,6 +1,6 @@
 """Every reader of what comes from outside, as a function of bytes; what it starts from, and how that is changed.
 
-A reader takes anything or raises what it documents. Used by tests/fuzz and by scripts/fuzz.py.
+A reader takes anything or raises what it documents. Used by tests/fuzz and by tools/fuzz.py.
 """
 
 from __future__ import annotations

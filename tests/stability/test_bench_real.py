@@ -11,11 +11,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_real import Run, planned, shadow_words
-from real_report import BUILT_IN, GIVEN, PAPER, agreement, goals, markdown
-from real_scenes import CLEARANCE, coverage, near, outside_hidden_volume, read_scene, ring
 from scenes import BLOCK, REGION, block, cameras, scene, truth
 
+from benchmarks.real import (
+    BUILT_IN,
+    CLEARANCE,
+    GIVEN,
+    PAPER,
+    Run,
+    agreement,
+    coverage,
+    goals,
+    near,
+    outside_hidden_volume,
+    planned,
+    report,
+    ring,
+)
+from benchmarks.scenes import read_scene, shadow_words
 from gimp3d.camera import Camera
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_mask, write_png
@@ -23,7 +36,7 @@ from gimp3d.io.ply import write_gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "bench_real.py"
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def silhouette(camera: Camera) -> np.ndarray:
@@ -146,16 +159,16 @@ def test_goals_count_the_marked_shadow_and_hold_refusals_against_a_preset() -> N
     telea = row(None, 0, method="telea", kind="", **{"psnr mask": 28.0})
     machine = {"cpu": "any", "cores": 2, "load_at_start": [0.0]}
     done = [row(0.9, 0.5), row(0.1, 5.0, kind=BUILT_IN), telea, row(0.5, 99.0, marked=False, counts=False)]
-    found = {g.name: g for g in goals({"rows": done, "coverage": [], "machine": machine})}
+    found = {g.name: g for g in goals({"rows": done, "coverage": [], "pictures": [], "machine": machine})}
     assert found["draft, given: mask, mean over real scenes"].met
     assert not found["draft, built-in: mask, mean over real scenes"].met
     worst = found["draft: mask against the better of emptied box and Telea, worst"]
     assert not worst.met and worst.found == "-3.00 dB in tiles_mug, built-in"
     assert not found["draft: mask against its own removal, not filled, worst"].met
     refused = {"scene": "real_bed", "method": "draft", "kind": GIVEN, "marked": False, "counts": True, "refused": "no"}
-    results = {"rows": [*done, refused], "coverage": [], "machine": machine}
+    results = {"rows": [*done, refused], "coverage": [], "pictures": [], "machine": machine}
     assert not next(g for g in goals(results) if g.name.startswith("draft, given")).met
-    assert "| real_bed |  | draft | given | no |" in markdown(results)
+    assert "| real_bed |  | draft | given | no |" in report(results)
 
 
 @pytest.mark.slow
@@ -163,8 +176,7 @@ def test_a_scene_with_a_shadow_is_measured_from_end_to_end(folder: Path, tmp_pat
     mark_shadow(folder)
     out = tmp_path / "out"
     command = [
-        sys.executable,
-        str(SCRIPT),
+        *(sys.executable, "-m", "benchmarks.real"),
         str(folder.parent),
         "--scenes",
         "block",
@@ -174,14 +186,14 @@ def test_a_scene_with_a_shadow_is_measured_from_end_to_end(folder: Path, tmp_pat
         str(out),
     ]
     for extra in ([], ["--reuse"]):
-        done = subprocess.run([*command, *extra], capture_output=True, text=True, timeout=500, check=False)
+        done = subprocess.run([*command, *extra], cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == 0, done.stderr[-2000:]
-    rows = json.loads((out / "results.json").read_text())["rows"]
+    rows = json.loads((out / "real.json").read_text())["rows"]
     assert [r["method"] for r in rows] == 2 * ["emptied box", "telea"] + 4 * ["draft"]
     assert all(r["psnr mask"] > rows[0]["psnr mask"] for r in rows if r["method"] == "draft")
-    assert "| block | marked | draft | given |" in (out / "table.md").read_text()
+    words = (out / "real.md").read_text()
+    assert "| block | marked | draft | given |" in words and "(block/draft_given.png)" in words
     assert (out / "block" / "draft_built-in_shadow_marked.png").exists()
-    assert "block/draft_given.png" in (out / "index.html").read_text()
 
 
 def test_folders_without_truth_have_no_test_views(folder: Path) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from perturbations import depth_errors, moved, noisy_depths, resized, turned
 from scenes import REGION, cameras, scene
 
+from benchmarks.perturbations import depth_errors, moved, noisy_depths, resized, turned
 from gimp3d.box import Box
 from gimp3d.raster import render, surface_depth
 from gimp3d.raster.backend import current_backend

@@ -11,9 +11,10 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from references_report import FILLED, GIVEN, draw_chart, markdown, means, sigma, sigma_by_view
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "bench_references.py"
+from benchmarks.references import FILLED, GIVEN, draw, means, report, sigma, sigma_by_view
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def row(reference: str, views: dict[str, float], preset: str = "balanced", kind: str = GIVEN) -> dict[str, Any]:
@@ -36,32 +37,36 @@ def test_a_worse_reference_is_spread_either_way() -> None:
     assert math.isnan(sigma([3.0]))
 
 
-def test_tables_and_chart_show_references_that_were_refused() -> None:
+def test_tables_and_chart_show_references_that_were_refused(tmp_path: Path) -> None:
     refused = {k: v for k, v in row("c", {}, "paper", FILLED).items() if k not in ("views", "score")} | {
         "refused": "sees no hole"
     }
     rows = [row("a", {"x": 30.0}), row("b", {"x": 32.0}), row("a", {"x": 20.0}, "paper", FILLED), refused]
-    results = {"machine": {"cpu": "any", "cores": 4}, "steps": 0, "references": rows}
-    words = markdown(results)
+    results = {"machine": {"cpu": "any", "cores": 4, "load_at_start": [0.0]}, "steps": 0, "references": rows}
+    words = report(results)
     assert "| desk | balanced | 2 | 0 | 31.00 ± 1.41 |" in words
     assert "| 1.41 (2) |" in words
     assert "| desk | paper | 1 | 1 | 20.00 ± nan |" in words and "| sees no hole |" in words
-    drawn = ElementTree.fromstring(draw_chart(results))
+    draw(results, tmp_path / "chart.svg")
+    drawn = ElementTree.parse(tmp_path / "chart.svg").getroot()
     assert "1.41" in {t.text for t in drawn.iter("{http://www.w3.org/2000/svg}text")}
 
 
-@pytest.mark.parametrize("script", [SCRIPT, SCRIPT.with_name("bench_stability.py")], ids=lambda s: s.stem)
-def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path, script: Path) -> None:
-    command = [sys.executable, str(script), str(tmp_path), "--quick", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+@pytest.mark.parametrize("name", ["references", "stability"])
+def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path, name: str) -> None:
+    out = str(tmp_path / "out")
+    command = [sys.executable, "-m", f"benchmarks.{name}", str(tmp_path), "--quick", "--out", out]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "has no truth/" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_two_true_pictures_give_nearly_the_same_removal(shared_data: Path, tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), str(shared_data / "withwithout"), "--quick", "--steps", "0"]
-    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, timeout=500)
+    command = [sys.executable, "-m", "benchmarks.references", str(shared_data / "withwithout"), "--quick"]
+    done = subprocess.run(
+        [*command, "--steps", "0", "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=500
+    )
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "references.json").read_text())["references"]
     assert len(rows) == 8 and not [r for r in rows if "refused" in r]

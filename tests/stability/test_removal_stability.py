@@ -12,20 +12,21 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
 from scenes import REGION, cameras, scene, truth
-from stability_report import draw_chart, markdown
 
-from gimp3d import pipeline
+from benchmarks.perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
+from benchmarks.stability import draw, report
 from gimp3d.camera import Camera
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.pipeline import PRESETS, RemovalResult, View, remove_object, render_bytes
+from gimp3d.run import Observer, unobserved
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "bench_stability.py"
+ROOT = Path(__file__).resolve().parents[2]
 REFERENCE, *OTHERS = cameras(9)
 ALL = (REFERENCE, *OTHERS)
 PHOTOS = {c.id: render_bytes(scene(), c) for c in ALL}
@@ -33,11 +34,16 @@ TRUTH = {c.id: render_bytes(truth(), c) for c in ALL}
 DIAGONAL = float(np.linalg.norm(REGION[0].size))
 
 
-def removed(views: tuple[Camera, ...] = ALL, photos: dict[str, np.ndarray] | None = None) -> RemovalResult:
+def removed(
+    views: tuple[Camera, ...] = ALL,
+    photos: dict[str, np.ndarray] | None = None,
+    observer: Observer = unobserved,
+) -> RemovalResult:
     """The block removed, the reference's true picture given."""
     photos = photos or {c.id: render_bytes(scene(), c) for c in views}
     given = [View(c, photos[c.id]) for c in views]
-    return remove_object(scene(), given, REGION, PRESETS["draft"], REFERENCE.id, TRUTH[REFERENCE.id])
+    settings, picture = PRESETS["draft"], TRUTH[REFERENCE.id]
+    return remove_object(scene(), given, REGION, settings, REFERENCE.id, picture, observer=observer)
 
 
 def score(result: RemovalResult, filled: bool = True) -> float:
@@ -74,8 +80,8 @@ CASES: dict[str, tuple[Callable[[], RemovalResult], Callable[[], AbstractContext
     "exposures off by 20 %": (lambda: photographed(exposed(PICTURES, 0.2, 0)), nullcontext, 0.5),
     "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 3),
     "a tenth of all pixels wrong": (lambda: photographed(garbled(PICTURES, 0.1, 0)), nullcontext, 2.5),
-    "surface off by 1 %": (removed, partial(noisy_surfaces, 0.01, 0), 3),
-    "surface off by 10 %": (removed, partial(noisy_surfaces, 0.1, 0), 19.5),
+    "surface off by 1 %": (lambda: removed(observer=noisy_surfaces(0.01, 0)), nullcontext, 3),
+    "surface off by 10 %": (lambda: removed(observer=noisy_surfaces(0.1, 0)), nullcontext, 19.5),
     "all depths off by 1 %": (removed, partial(noisy_depths, 0.01, 0), 1),
     "all depths off by 10 %": (removed, partial(noisy_depths, 0.1, 0), 17),
 }
@@ -96,10 +102,7 @@ def test_nothing_explodes(case: str) -> None:
 
 
 def test_more_noise_is_worse_but_never_worse_than_the_hole() -> None:
-    found = []
-    for relative in (0.01, 0.03, 0.1):
-        with noisy_surfaces(relative, 0):
-            found.append(score(removed()))
+    found = [score(removed(observer=noisy_surfaces(relative, 0))) for relative in (0.01, 0.03, 0.1)]
     assert unperturbed() + 1 > found[0] > found[1] > found[2] > score(removed(), filled=False) + 3  # 1 dB: chance
 
 
@@ -132,30 +135,43 @@ def test_gathered_views_look_at_the_region_from_one_side(degrees: float) -> None
         np.testing.assert_allclose(camera.R @ camera.R.T, np.eye(3), atol=1e-12)
 
 
-def test_only_completed_surfaces_are_off_inside() -> None:
-    before = pipeline._complete_depth
-    with pytest.raises(RuntimeError), noisy_surfaces(0.1, 0):
-        assert pipeline._complete_depth is not before
-        raise RuntimeError
-    assert pipeline._complete_depth is before
+def test_only_completed_surfaces_are_off() -> None:
+    exact: dict[str, Any] = {}
+    off: list[str] = []
+
+    def watched(name: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
+        exact[name] = work(*inputs)
+        found = noisy_surfaces(0.1, 0)(name, lambda *_: exact[name], inputs)
+        off.extend([name] * (found is not exact[name]))
+        return found
+
+    removed(observer=watched)
+    assert off and all(name.startswith("depth") for name in off)
 
 
-def test_table_and_chart_show_what_was_refused() -> None:
+def test_table_and_chart_show_what_was_refused(tmp_path: Path) -> None:
     row = {"scene": "desk", "kind": "none", "level": 0.0, "mask": 30.0, "unseen": 28.0, "open mask": 12.0}
     row |= {"open unseen": 9.0, "added": 10, "finite": True, "largest": 0.02, "farthest": 0.5, "warnings": ["careful"]}
     worse = row | {"kind": "surface", "level": 0.1, "mask": 20.0, "finite": False, "largest": 0.3}
     refused = {"scene": "desk", "kind": "surface", "level": 0.03, "refused": "sees no hole"}
-    results = {"machine": {"cpu": "any", "cores": 4}, "preset": "draft", "rows": [row, worse, refused]}
-    words = markdown(results)
+    results = {
+        "machine": {"cpu": "any", "cores": 4, "load_at_start": [0.0]},
+        "preset": "draft",
+        "rows": [row, worse, refused],
+    }
+    words = report(results)
     assert "| 20.00 |" in words and "| NO |" in words and "| sees no hole |" in words and "| careful |" in words
-    drawn = ElementTree.fromstring(draw_chart(results))
+    draw(results, tmp_path / "chart.svg")
+    drawn = ElementTree.parse(tmp_path / "chart.svg").getroot()
     assert {"Surface off, %", "10", "3"} <= {t.text for t in drawn.iter("{http://www.w3.org/2000/svg}text")}
 
 
 @pytest.mark.slow
 def test_on_a_rendered_scene_it_bends_too(shared_data: Path, tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), str(shared_data / "withwithout"), "--quick", "--preset", "draft"]
-    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, timeout=500)
+    command = [sys.executable, "-m", "benchmarks.stability", str(shared_data / "withwithout"), "--quick"]
+    done = subprocess.run(
+        [*command, "--preset", "draft", "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=500
+    )
     assert done.returncode == 0, done.stderr
     rows = {r["kind"]: r for r in json.loads((tmp_path / "stability.json").read_text())["rows"]}
     assert set(rows) == {"none", "views", "misplaced", "surface"} and all(r["finite"] for r in rows.values())

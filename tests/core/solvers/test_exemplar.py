@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from structured import edge_error, structured
 
 from gimp3d.evaluate.metrics import psnr
 from gimp3d.solvers.exemplar import ExemplarSettings, complete_picture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "scripts"))
-from structured import edge_error, structured
 
 PICTURES = structured()
 

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from structured import structured
 
 from gimp3d.solvers.regularity import continue_regularly, find_motions
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "scripts"))
-from structured import structured
 
 PICTURES = structured()
 

@@ -7,19 +7,28 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.slow
-def test_the_benchmark_runs_and_its_targets_hold_on_a_few_cases(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "scripts" / "bench_depth.py"), "--quick", "--out", str(tmp_path)]
-    done = subprocess.run([*command, "--data", str(tmp_path)], capture_output=True, text=True, check=False)
+def test_a_measured_scale_beats_the_papers_and_a_prior_with_the_sign_as_printed(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.depth",
+        str(shared_data / "withwithout"),
+        "--quick",
+        "--scenes",
+        "desk",
+    ]
+    done = subprocess.run([*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "depth.json").read_text())
-    assert len(found["scale"]) == 15 and len(found["places"]) == 8 and found["scenes"] == []
-    ways = {k: np.mean([r["membrane"][k] for r in found["scale"]]) for k in found["scale"][0]["membrane"]}
-    assert ways["best"] <= ways["measured"] < ways["none"] < ways["as printed"]
-    assert "| relief |" in (tmp_path / "depth.md").read_text()
+    rows = json.loads((tmp_path / "depth.json").read_text())["scenes"]
+    errors = {r["way"]: r["hole"]["median"] for r in rows}
+    assert errors["membrane, bias 5 %"] < errors["s_f = 0.1, bias 5 %"] < errors["sign as printed, bias 5 %"]
+    assert errors["guided, true"] <= errors["harmonic"] and errors["auto"] < errors["harmonic"]
+    assert "| ring |" in (tmp_path / "depth.md").read_text()

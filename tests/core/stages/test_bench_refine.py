@@ -18,9 +18,9 @@ from gimp3d.raster import render
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def run(script: str, *arguments: str) -> str:
-    command = [sys.executable, str(ROOT / "scripts" / script), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+def run(name: str, *arguments: str) -> str:
+    command = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 
@@ -29,13 +29,13 @@ def run(script: str, *arguments: str) -> str:
 def test_balanced_beats_draft_and_both_need_less_than_half_a_gaussian_per_pixel(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    run("bench_refine.py", str(shared_data / "withwithout"), "--quick", "--out", str(tmp_path))
-    rows = {r["method"]: r for r in json.loads((tmp_path / "refine.json").read_text())}
+    run("pareto", str(shared_data / "withwithout"), "--quick", "--out", str(tmp_path))
+    rows = {r["method"]: r for r in json.loads((tmp_path / "pareto.json").read_text())["rows"]}
     assert rows["balanced"]["psnr unseen"] > rows["draft"]["psnr unseen"]
     assert rows["draft"]["psnr mask"] > rows["telea"]["psnr mask"] + 6
     assert 0 < rows["draft"]["share"] < 0.6 and 0 < rows["balanced"]["share"] < 0.6
     assert rows["balanced"]["seconds"] > rows["draft"]["seconds"] > 0
-    assert "| desk | balanced |" in (tmp_path / "refine.md").read_text()
+    assert "| desk | balanced |" in (tmp_path / "pareto.md").read_text()
     ElementTree.fromstring((tmp_path / "pareto.svg").read_text())
 
 
@@ -43,7 +43,7 @@ def test_balanced_beats_draft_and_both_need_less_than_half_a_gaussian_per_pixel(
 def test_the_large_scene_looks_like_the_one_it_is_made_of(shared_data: Path, tmp_path: Path) -> None:
     scene = shared_data / "withwithout" / "desk"
     options = ("--split", "2", "--views", "12", "--scale", "1", "--preset", "draft")
-    said = run("bench_large.py", str(scene), *options, "--out", str(tmp_path))
+    said = run("large", str(scene), *options, "--out", str(tmp_path))
     assert "Peak memory" in said and "| seed |" in said
     before, after = read_ply(scene / "scene.ply").gaussians, read_ply(tmp_path / "scene.ply").gaussians
     assert len(after) == 2 * before.usable.sum()

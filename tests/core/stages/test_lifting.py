@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 from light_ablation import Prepared, found_in, made
-from light_scenes import Lamp, make_scene
+from lit_scenes import Lamp, make_scene
 
 from gimp3d.camera import Camera
 from gimp3d.stages.lifting import Arriving, _lifted, light_in

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from light_scenes import Lamp, blocked, cube
+from lit_scenes import Lamp, blocked, cube
 from scenes import BLOCK, REGION, block, floor
 
 from gimp3d.box import Box

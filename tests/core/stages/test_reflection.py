@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from light_scenes import Lamp, LitScene, cube, glossy_scene, grain, make_scene, reflected
+from lit_scenes import Lamp, LitScene, cube, glossy_scene, grain, make_scene, reflected
 from scenes import BLOCK, REGION
 
 from gimp3d.box import Box

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
-from light_scenes import Lamp, LitScene, blocked, grain, make_scene, plain, rug, stain, tiles
+from lit_scenes import Lamp, LitScene, blocked, grain, make_scene, plain, rug, stain, tiles
 from scenes import BLOCK, floor_colours
 
 from gimp3d.box import Box

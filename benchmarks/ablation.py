@@ -1,0 +1,199 @@
+"""What each rule is worth: one at a time is switched off, in whole removals of scenes with truth, made and real.
+
+    python -m benchmarks.ablation [DATA] [--scenes a,b] [--rules WORD …] [--picture given built-in]
+
+A rule is a dotted setting of `RemovalSettings` or `module:NAME`, a constant or function of the module that uses it; it
+is looked up only when its row runs, and a name that is gone fills the row with a clear line. (What a kernel reads is
+frozen when it is compiled: such a constant cannot be switched here.) Finished cells lie in OUT/cells.json, so a stopped
+run goes on; delete it after a change to the core. Writes OUT/ablation.md. Run by `make bench-ablation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields, is_dataclass, replace
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from gimp3d.errors import BadInput, IllPosed
+from gimp3d.pipeline import PRESETS, RemovalSettings
+
+from .command import kept, parser_of, say, told_in_one_line, write
+from .scenes import MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
+from .tables import Row, Section, markdown
+from .timing import about, machine, replaced, timed
+
+SCENES = (*MADE, "desk_shadow", "corner_shadow", *REAL)
+GIVEN, BUILT_IN = "given", "built-in"  # the first test view's true picture is the reference, or none is given
+PRESET = "balanced"
+Switch = tuple[str, Any]  # what, and its value when the rule is off
+
+
+@dataclass(frozen=True)
+class Around:
+    """A function that is made of the one that it stands for."""
+
+    make: Callable[[Any], Any]
+
+
+def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
+    return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
+
+
+ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
+BY_PLACE_ALONE = Around(lambda besides: lambda surface, bent: besides(surface, bent)[:, : 5 if bent else 2])
+RULES: dict[str, tuple[Switch, ...]] = {
+    # what is object, where is filled, from which surface
+    "no charts: photos are the only references": (("charts", None),),
+    "photos copy nothing of the hidden surface": (("use_evidence", False),),
+    "no further references": (("extra_references", 0),),
+    "targets as the paper's": (("masks.mode", "paper"), ("charts", None)),
+    "what has its centre in the box is the object": (("masks.selection.by_centre", True),),
+    "a membrane behind the object": (("depth.surface", "harmonic"),),
+    # into the other views
+    "no colours learned: the warp": (("propagate.transfer", "none"),),
+    "no retargeting": (("propagate.retarget", 0),),
+    "the paper's sampling": (("propagate.transfer", "sample"),),
+    "the paper's blend": (("propagate.blend", "rim"),),
+    "patches in the picture, not on the surface": (("mapping.geometry", False),),
+    # new Gaussians
+    "one Gaussian per pixel": (("seed.largest", 1),),
+    "colours as seeded": (("seed.corrections", 0),),
+    "no view dependence": (("seed.sh_degree", 0),),
+    "degree 1": (("seed.sh_degree", 1),),
+    "degree 3": (("seed.sh_degree", 3),),
+    "views' common offset is fitted": (("seed.harmonics.offset", False),),
+    "not refined": (("refine.steps", 0),),
+    "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
+    # the fill
+    "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
+    "whole patches vote in the end": (("gimp3d.solvers.exemplar:OWN", 99),),
+    "only patches' middle pixels vote": (("gimp3d.solvers.exemplar:OWN", 0),),
+    "Telea's fill": (("inpaint", "telea"),),
+    # the object's light
+    "shadows and reflections stay": (("shadow", "off"),),
+    "a light need not beat chance": (("gimp3d.stages.light_search:EARNS", 1e-9),),
+    "a light need not explain what is uneven": (("gimp3d.stages.light_search:FITS", 1e-9),),
+    "a shadow may be missing round the object": (("gimp3d.stages.shadow:FAINT", -1.0),),
+    "one light at most": (("gimp3d.stages.light_search:MOST", 1),),
+    "hue is no paint": (("gimp3d.solvers.lights:_besides", BY_PLACE_ALONE),),
+    "strength by blocks of all sizes": (("gimp3d.stages.shadow:BROAD", (4, 8, 16, 32)),),
+    "sky only as far as photos ask": (("gimp3d.stages.shadow:DULL", 0.0),),
+    "depth alone tells what is ground": (("gimp3d.stages.lifting:_shows", _by_depth_alone),),
+    "pixels beside the object are lifted": (("gimp3d.stages.lifting:MIXED", 0.3),),
+    "the darkest are lifted": (("gimp3d.stages.lifting:DARKEST", 0.05),),
+    "no walls beside it": (("gimp3d.stages.ground:_walls", lambda *_: []),),
+}
+
+
+def main() -> None:
+    parser = parser_of(__doc__, "ablation", data=True, quick="one made scene, two rules")
+    parser.add_argument("--scenes", default=",".join(SCENES), help="folders of DATA, separated by commas")
+    parser.add_argument("--rules", nargs="*", default=[], metavar="WORD", help="rules that hold one of these words")
+    parser.add_argument("--picture", nargs="*", default=[GIVEN, BUILT_IN], choices=[GIVEN, BUILT_IN])
+    given = parser.parse_args()
+    names = [rule for rule in RULES if not given.rules or any(word in rule for word in given.rules)]
+    scenes = read_scenes(given.data, "desk" if given.quick else given.scenes, needs_truth=True)
+    if given.quick:
+        names, given.picture = ["no colours learned: the warp", "not refined"], [GIVEN]
+    cells: dict[tuple[str, str, str], Row] = {}
+    for scene in scenes:
+        for picture in given.picture:
+            for rule in ("", *names):
+                switches = RULES[rule] if rule else ()
+                key = f"{scene.name} | {picture} | {rule} | {[what for what, _ in switches]}"
+                cell = kept(given.out / "cells.json", key, lambda s=scene, p=picture, w=switches: measured(s, p, w))
+                cells[scene.name, picture, rule] = cell
+                say(f"{scene.name:16}{picture:10}{rule or 'as it is':48}" + _cell(cell, cells[scene.name, picture, ""]))
+            words = markdown("What each rule is worth", about(machine()), sections(cells, given.picture))
+            write(given.out / "ablation.md", words)
+
+
+def measured(scene: Scene, picture: str, switches: Sequence[Switch]) -> Row:
+    """PSNR in the mask and where no view looks, and seconds of a removal; or why there are none."""
+    reference = scene.test[0] if picture == GIVEN else None
+    true_picture = scene.truth(reference) if reference else None
+    try:
+        settings = changed(PRESETS[PRESET], switches)
+        with switched_off(switches):
+            results: list[Any] = []
+            wall, cpu = timed(lambda: results.append(removal(scene, settings, reference, true_picture)))
+    except (BadInput, IllPosed) as error:
+        return {"refused": str(error)}
+    found = mean_psnrs(scene, filled(scene.gaussians, results[0]), scene.test[1:])
+    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(results[0].added or ())}
+
+
+def changed(settings: RemovalSettings, switches: Sequence[Switch]) -> RemovalSettings:
+    """The settings with those switches that are settings."""
+    for path, value in switches:
+        if ":" not in path:
+            settings = _with(settings, path.split("."), value, path)
+    return settings
+
+
+def _with(settings: Any, path: Sequence[str], value: Any, whole: str) -> Any:
+    if not is_dataclass(settings) or path[0] not in {f.name for f in fields(settings)}:
+        raise BadInput(f"ablation: there is no setting {whole} any more: mend RULES")
+    inner = value if len(path) == 1 else _with(getattr(settings, path[0]), path[1:], value, whole)
+    return replace(settings, **{path[0]: inner})
+
+
+@contextmanager
+def switched_off(switches: Sequence[Switch]) -> Iterator[None]:
+    """Those switches that are a module's constants or functions have their other value inside."""
+    with ExitStack() as stack:
+        for what, value in switches:
+            if ":" in what:
+                module_name, name = what.split(":")
+                try:
+                    module = import_module(module_name)
+                    before = getattr(module, name)
+                except (ImportError, AttributeError):
+                    raise BadInput(f"ablation: there is no {what} any more: mend RULES") from None
+                stack.enter_context(replaced(module, name, value.make(before) if isinstance(value, Around) else value))
+        yield
+
+
+def _cell(cell: Row, before: Row) -> str:
+    if "refused" in cell or "refused" in before:
+        return cell.get("refused") or "–"
+    changes = " / ".join(f"{cell[mask] - before[mask]:+.2f}" for mask in MASKS)
+    return f"{changes} ({cell['seconds']:.0f} s)"
+
+
+def sections(cells: dict[tuple[str, str, str], Row], pictures: Sequence[str]) -> Iterator[Section]:
+    for picture in pictures:
+        scenes = list(dict.fromkeys(s for s, p, _ in cells if p == picture))
+        lines = []
+        for rule in dict.fromkeys(r for _, p, r in cells if p == picture):
+            of = [(cells[s, picture, ""], cells[s, picture, rule]) for s in scenes if (s, picture, rule) in cells]
+            done = [(b, c) for b, c in of if "refused" not in b and "refused" not in c]
+            line = [rule or "as it is"]
+            for mask in MASKS:
+                found = [c[mask] if not rule else c[mask] - b[mask] for b, c in done]
+                form = "{:+.2f}" if rule else "{:.2f}"
+                line += [form.format(f(found)) if found else "–" for f in (np.mean, min, max)]
+            seconds = [c["cpu_s"] - (b["cpu_s"] if rule else 0) for b, c in done]
+            line.append(f"{np.mean(seconds):+.1f}" if seconds else "–")
+            for b, c in of:
+                if rule:
+                    line.append(_cell(c, b))
+                else:
+                    line.append(b.get("refused") or f"{b['mask']:.2f} / {b['unseen']:.2f} ({b['seconds']:.0f} s)")
+            lines.append(line + [""] * (len(scenes) - len(of)))
+        head = ["rule switched off", *(f"{m}: {w}" for m in MASKS for w in ("mean", "worst", "best")), "CPU s", *scenes]
+        yield Section(
+            f"Picture {picture}",
+            f"Preset {PRESET}; PSNR of the test views but the first, dB: change against the first row, in what the "
+            "object hides (mask) and in what no training view sees of it (unseen). By scene: mask / unseen (seconds).",
+            head,
+            lines,
+        )
+
+
+if __name__ == "__main__":
+    told_in_one_line(main)

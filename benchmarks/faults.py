@@ -1,0 +1,116 @@
+"""Counts what was done to the program and what of it went wrong: inputs, faults, kills, moved scenes, changed files.
+
+Prints the table of docs/reliability.md and writes it to OUT/reliability.md. Run by `make bench-faults`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+from .command import ROOT, parser_of, say, told_in_one_line, write
+from .tables import table
+
+sys.path[:0] = [str(ROOT / "tests" / "e2e"), str(ROOT / "tests" / "fuzz")]
+from test_faults import KILLS, MOMENTS
+from test_fuzz import FEW
+
+CASES_OF = {  # tests that stand for more than one case
+    "test_a_signal_at_any_moment_leaves_out_whole": MOMENTS,
+    "test_a_killed_removal_goes_on_to_the_same_bytes": KILLS,
+    "test_changed_files_are_read_or_refused": FEW,
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is tried, by which tests, and what has to hold."""
+
+    what: str
+    tests: str
+    holds: str
+    chosen: str = ""  # as pytest's -k
+
+
+ROWS = (
+    Row(
+        "wrong inputs: files, options, values, library calls",
+        "tests/core/test_schema.py tests/core/io tests/core/test_box.py tests/core/test_camera.py "
+        "tests/e2e/test_command_line.py",
+        "one line, exit 2 or 3, no output",
+        "refused or bad or no_setting or no_other_setting or no_sensible or no_scene or damaged or truncated or "
+        "lies or memory or description or larger or words_are_checked",
+    ),
+    Row("jobs and files that reach out, or run something", "tests/core/test_job.py", "refused before any write"),
+    Row(
+        "faults: targets, devices, links, streams, memory, stage files",
+        "tests/core/test_files.py tests/e2e/test_faults.py",
+        "the exit code of the contract, OUT as it was",
+        "not any_moment and not killed_removal",
+    ),
+    Row(
+        "kills: SIGINT, SIGTERM, SIGHUP, SIGKILL at moments spread over a run",
+        "tests/e2e/test_faults.py",
+        "OUT is the old or the new one, whole; a run goes on to the same bytes",
+        "any_moment or killed_removal",
+    ),
+    Row("moved scenes: units, shifts, turns", "tests/stability/test_units.py", "the same picture to 0.05 dB"),
+    Row("changed files, a few for every reader", "tests/fuzz", "read or refused", "not minute"),
+)
+
+
+def main() -> int:
+    parser = parser_of(__doc__, "faults")
+    parser.add_argument("--fuzz", type=Path, default=ROOT / "build" / "fuzz")
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    lines, wrong = [], 0
+    for row in ROWS:
+        say(row.what)
+        tried, lost, seconds = run(row, given.out / "results.xml")
+        wrong += lost
+        lines.append([row.what, row.holds, f"{tried:,}", lost, f"{seconds:.0f}"])
+    head = ("tried", "what has to hold", "number", "lost", "seconds")
+    words = table(head, [*lines, *fuzzed(given.fuzz)])
+    say(words)
+    write(given.out / "reliability.md", words)
+    return 1 if wrong else 0
+
+
+def run(row: Row, results: Path) -> tuple[int, int, float]:
+    """How many cases of a row were tried, how many failed, and how long it took."""
+    start = time.perf_counter()
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={results}"]
+    command += [*row.tests.split(), *(("-k", row.chosen) if row.chosen else ())]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    tried = lost = 0
+    for case in ElementTree.parse(results).getroot().iter("testcase"):
+        if case.find("skipped") is not None:
+            continue
+        tried += next((count for test, count in CASES_OF.items() if case.attrib["name"].startswith(test)), 1)
+        lost += case.find("failure") is not None or case.find("error") is not None
+    if lost:
+        say(done.stdout[-3000:])
+    return tried, lost, time.perf_counter() - start
+
+
+def fuzzed(folder: Path) -> Iterator[list[object]]:
+    """What `make fuzz` has done so far, as rows."""
+    path = folder / "counts.json"
+    if path.exists():
+        counts = json.loads(path.read_text())
+        found = len(os.listdir(folder / "found")) if (folder / "found").is_dir() else 0
+        cases, seconds = (sum(c[what] for c in counts.values()) for what in ("cases", "seconds"))
+        what = f"changed files, `make fuzz`, {len(counts)} readers"
+        yield [what, "read or refused", f"{cases:,}", found, f"{seconds:.0f}"]
+
+
+if __name__ == "__main__":
+    told_in_one_line(main)

@@ -1,0 +1,168 @@
+"""The object's shadow: is it found, is the light right, and what is left of it once the object is gone.
+
+Four parts. Removals of scenes with a shadow, as `gimp3d` in a process of its own: shadow undone, left alone, and put
+into the hole where the truth marks it. Made scenes whose light is known, and such whose floor is glossy
+(tests/lit_scenes.py). And scenes without a shadow, of which none must be found: each with several random draws of four
+views in five. With --without, a rule of benchmarks.ablation is switched off in the last three. Writes OUT/light.md and
+a sheet of pictures per scene. Run by `make bench-light`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from lit_scenes import LitScene, glossy_scene, reflected, shadowed_scenes, unshadowed_scenes
+
+from gimp3d.camera import Camera, output_name
+from gimp3d.commands import render_views
+from gimp3d.evaluate.metrics import psnr
+from gimp3d.io.images import read_image, write_png
+from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
+from gimp3d.srgb import linear
+
+from .ablation import RULES, switched_off
+from .command import parser_of, say, told_in_one_line, write
+from .scenes import MADE, Scene, filled, gimp3d, read_scene, removal, remove_words, shadow_words
+from .tables import Section, markdown, sheet
+from .timing import about, machine, timed
+
+SHADOWED = ("tiles_mug", "kitchen_monkey", "desk_shadow", "corner_shadow")
+CLEAR = (*MADE, "real_table")
+DIFFERS = 0.04  # share of white by which photos with and without the shadow differ in it
+GLOSSY = (0.1, 0.2, 0.4)  # share of light that comes back from a floor
+KEPT = 0.8  # of the views in a draw
+DARK = 4e-3  # of linear light, below which darkness is noise
+WAYS = {"undone": ["--shadow", "auto"], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}
+
+
+def main() -> None:
+    parser = parser_of(__doc__, "light", data=True)
+    parser.add_argument("--draws", type=int, default=10)
+    parser.add_argument("--skip-removals", action="store_true")
+    parser.add_argument("--without", choices=RULES, metavar="RULE", help="as named in benchmarks.ablation")
+    given = parser.parse_args()
+    sections = []
+
+    def section(title: str, head: Sequence[str], rows: Iterator[list[str]]) -> None:
+        sections.append(Section(title, "", head, []))
+        for row in rows:
+            sections[-1].rows.append(row)
+            say(" | ".join(row))
+
+    if not given.skip_removals:
+        head = ("scene", "shadow", "mask dB", "in the shadow dB", "darkening left", "light", "seconds")
+        scenes = (read_scene(given.data / name, needs_truth=True) for name in SHADOWED)
+        section("Removals", head, (row for s in scenes for row in removals(s, given.out / s.name)))
+    with switched_off(RULES[given.without] if given.without else ()):
+        made, folder = (*shadowed_scenes(), *unshadowed_scenes()), given.out / "made"
+        head = ("made scene", "found", "off by", "darkening left", "seconds")
+        section("Known light", head, (known_light(m, folder) for m in made))
+        head = ("glossy floor", "found", "in the reflection dB: left, undone", "seconds")
+        section("Known reflections", head, (known_reflection(strength, folder) for strength in GLOSSY))
+        clear = [given.data / name for name in CLEAR]
+        rows = ([f.name, f"{sum(draw(f, k) for k in range(given.draws))} of {given.draws}"] for f in clear)
+        section("Without a shadow", ("scene", "found in draws"), rows)
+    words = f"{about(machine())} Without: {given.without or 'nothing'}."
+    write(given.out / "light.md", markdown("The object's light", words, sections))
+
+
+def removals(scene: Scene, folder: Path) -> Iterator[list[str]]:
+    """Rows of the table; their pictures lie in the folder."""
+    for way, words in WAYS.items():
+        if way == "filled" and not scene.has_shadow:
+            continue
+        out, summary = folder / way / "out.ply", folder / way / "summary.json"
+        marked = shadow_words(scene, folder) if way == "filled" else []
+        if message := gimp3d([*remove_words(scene, out), *words, *marked, "--summary", str(summary)]):
+            yield [scene.name, way, f"refused: {message}", "", "", "", ""]
+            continue
+        render_views(out, scene.folder / "transforms.json", folder / way / "render", split="test")
+        scores, before, after, rows = [], [], [], []
+        for camera in scene.test[1:]:
+            truth, photo = scene.truth(camera), scene.with_object(camera)
+            drawn = read_image(folder / way / "render" / f"{output_name(camera.id)}.png")
+            hidden, shadow = scene.hides(camera), shadow_of(scene, camera)
+            scores.append((psnr(drawn, truth, hidden & ~shadow), psnr(drawn, truth, shadow)))
+            before.append(light(photo)[shadow] - light(truth)[shadow])
+            after.append(light(drawn)[shadow] - light(truth)[shadow])
+            rows.append({output_name(camera.id): photo, "truth": truth, way: drawn})
+        write_png(folder / f"{way}.png", sheet(rows))
+        facts, left = json.loads(summary.read_text()), np.concatenate(after).mean() / np.concatenate(before).mean()
+        lamps = ", ".join(f"{x['elevation']:.0f}°/{x['azimuth']:.0f}°" for x in facts["shadow"]["lights"]) or "–"
+        numbers = [f"{x:.2f}" for x in np.mean(scores, axis=0)]
+        yield [scene.name, way, *numbers, f"{left:.0%}", lamps, f"{facts['seconds_total']:.1f}"]
+
+
+def shadow_of(scene: Scene, camera: Camera) -> np.ndarray:
+    """[H, W] bool: the truth's; of scenes lit twice, where photos with and without the shadow differ."""
+    if scene.has_shadow:
+        return scene.shadow(camera)
+    clean = read_scene(scene.folder.parent / scene.name.removesuffix("_shadow"))
+    a, b = (s.with_object(camera).astype(float) / 255 for s in (scene, clean))
+    return (np.abs(a - b).mean(-1) > DIFFERS) & ~scene.hides(camera)
+
+
+def light(picture: np.ndarray) -> np.ndarray:
+    """[H, W] log luminance."""
+    return np.log(linear(picture).mean(-1) + DARK)
+
+
+def known_light(made: LitScene, folder: Path) -> list[str]:
+    views = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()]
+    results = []
+    wall, _ = timed(lambda: results.append(remove_object(made.gaussians, views, made.region, PRESETS["draft"])))
+    result, final = results[0], filled(made.gaussians, results[0])
+    towards = [np.array(x["direction"]) for x in result.shadow["lights"]]
+    off = [min([angle(lamp.direction, t) for t in towards], default=180.0) for lamp in made.lamps]
+    before, after, rows = [], [], []
+    for view in views[::3]:
+        truth, drawn = render_bytes(made.truth, view.camera), render_bytes(final, view.camera)
+        block = (view.image[..., 0].astype(int) - view.image[..., 1] > 70).astype(np.uint8)
+        dark = light(view.image) - light(truth)
+        shadow = (dark < -0.1) & (cv2.dilate(block, np.ones((9, 9), np.uint8)) == 0)
+        before.append(dark[shadow])
+        after.append((light(drawn) - light(truth))[shadow])
+        rows.append({made.name: view.image, "truth": truth, "result": drawn})
+    write_png(folder / f"{made.name.replace(' ', '_')}.png", sheet(rows))
+    gone = np.concatenate(before)
+    left = f"{np.concatenate(after).sum() / gone.sum():.0%}" if len(gone) and made.lamps else "–"
+    degrees = ", ".join(f"{x:.1f}°" for x in off) or "–"
+    return [made.name, "yes" if result.shadow["found"] else "no", degrees, left, f"{wall / 1e3:.1f}"]
+
+
+def known_reflection(strength: float, folder: Path) -> list[str]:
+    made = glossy_scene(strength)
+    views = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()]
+    scores, pictures = [], [{"truth": render_bytes(made.truth, v.camera)} for v in views[::3]]
+    for way in ("off", "auto"):
+        settings, results = replace(PRESETS["balanced"], shadow=way), []
+        wall, _ = timed(lambda s=settings, r=results: r.append(remove_object(made.gaussians, views, made.region, s)))
+        final = filled(made.gaussians, results[0])
+        for view, row in zip(views[::3], pictures):
+            row[way] = render_bytes(final, view.camera)
+        where = [reflected(made, v.camera) for v in views[::3]]
+        scores.append(np.mean([psnr(row[way], row["truth"], there) for row, there in zip(pictures, where)]))
+    write_png(folder / f"glossy_{strength:.2f}.png", sheet(pictures))
+    found = "yes" if results[0].reflection["found"] else "no"
+    return [f"{strength:.0%} comes back", found, f"{scores[0]:.1f}, {scores[1]:.1f}", f"{wall / 1e3:.1f}"]
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(b), -1, 1))))
+
+
+def draw(folder: Path, seed: int) -> bool:
+    """Whether a shadow is found with some of the scene's views."""
+    scene, rng = read_scene(folder), np.random.default_rng(seed)
+    chosen = sorted(rng.choice(len(scene.views), round(KEPT * len(scene.views)), replace=False))
+    result = removal(scene, replace(PRESETS["draft"], inpaint="telea"), views=[scene.views[k] for k in chosen])
+    return bool(result.shadow["found"])
+
+
+if __name__ == "__main__":
+    told_in_one_line(main)

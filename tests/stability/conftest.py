@@ -1,8 +1,0 @@
-"""The perturbations and measures are those of the benchmark."""
-
-from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
