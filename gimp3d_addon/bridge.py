@@ -23,17 +23,13 @@ from gimp3d.errors import BadInput
 from gimp3d.io.cameras import make_camera, rigid
 
 from . import trust
+from .chosen import present
 
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
 CHART = "gimp3d_chart"  # custom property of cameras that face a hidden surface: N of the reference chart:N
 SENSOR = 36.0  # mm, of imported cameras
 STRAIGHT = 1e-6  # from here on a turn is meant: Blender's own quarter turns are off by 4e-8
-
-
-def present(scene: bpy.types.Scene, obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The object, unless the user has deleted it: a pointer to it keeps a deleted object in the file."""
-    return obj if obj is not None and scene.objects.get(obj.name) == obj else None
 
 
 def splat_frame(obj: bpy.types.Object) -> np.ndarray:
@@ -197,22 +193,11 @@ def camera_to_blender(camera: Camera, frame: Matrix, number: int = 0) -> bpy.typ
     local = Matrix((np.linalg.inv(camera.viewmat) @ BLENDER_TO_OPENCV).tolist())
     location, rotation, _ = (frame @ local).decompose()
     obj.matrix_world = Matrix.LocRotScale(location, rotation, None)
-    obj[CAMERA] = json.dumps(
-        {
-            "id": camera.id,
-            "number": number,
-            "width": camera.width,
-            "height": camera.height,
-            "fx": camera.fx,
-            "fy": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-            "split": camera.split,
-            "viewmat": camera.viewmat.tolist(),
-            "distortion": camera.distortion.coefficients.tolist() if camera.distortion else None,
-            "image": str(camera.image.resolve()) if camera.image and camera.image.exists() else None,
-        }
-    )
+    kept = {name: getattr(camera, name) for name in ("id", "width", "height", "fx", "fy", "cx", "cy", "split")}
+    kept |= {"number": number, "viewmat": camera.viewmat.tolist()}
+    kept["distortion"] = camera.distortion.coefficients.tolist() if camera.distortion else None
+    kept["image"] = str(camera.image.resolve()) if camera.image and camera.image.exists() else None
+    obj[CAMERA] = json.dumps(kept)
     return obj
 
 
@@ -364,10 +349,7 @@ def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Cam
         for number in range(scene.frame_start, scene.frame_end + 1, scene.frame_step):
             scene.frame_set(number)
             depsgraph = context.evaluated_depsgraph_get()
-            yield (
-                camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"),
-                obj,
-            )
+            yield camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"), obj
     finally:
         scene.frame_set(current[0], subframe=current[1])
 

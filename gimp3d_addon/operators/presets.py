@@ -15,6 +15,3 @@ class GIMP3D_OT_add_preset(AddPresetBase, bpy.types.Operator):
     preset_subdir = "gimp3d"
     preset_defines = ("settings = bpy.context.scene.gimp3d",)
     preset_values = ("settings.preset", "settings.inpaint", "settings.depth_prior", "settings.seed")
-
-
-CLASSES = (GIMP3D_OT_add_preset,)
