@@ -7,12 +7,9 @@ from types import ModuleType
 import bpy
 
 from . import command, panels, preferences, properties
-from .operators import base, display, environment, io, presets, reference, remove, roi, views
+from .operators import base, display, environment, io, reference, remove, roi, views
 
-MODULES = (
-    *(properties, base, environment, preferences, io, display, roi, views, reference, remove, presets),
-    *(panels, command),
-)
+MODULES = (properties, base, environment, preferences, io, display, roi, views, reference, remove, panels, command)
 
 
 def classes_of(module: ModuleType) -> list[type]:

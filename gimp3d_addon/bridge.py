@@ -75,9 +75,7 @@ def camera_from_blender(
     BadInput
         If it is not a perspective camera.
     """
-    data = obj.data
-    if data.type != "PERSP":
-        raise BadInput(f"camera {obj.name} is {data.type.lower()}; only perspective cameras can be views")
+    _require_perspective(obj)
     pose = np.array(obj.evaluated_get(depsgraph).matrix_world, dtype=np.float64)
     local = np.linalg.inv(frame) @ pose
     u, _, vt = np.linalg.svd(local[:3, :3])
@@ -104,6 +102,11 @@ def camera_from_blender(
     fx, fy = width / 2 * p[0][0], height / 2 * p[1][1]
     cx, cy = width / 2 * (1 - p[0][2]), height / 2 * (1 + p[1][2])
     return Camera(name or safe_name(obj.name), width, height, fx, fy, cx, cy, viewmat)
+
+
+def _require_perspective(obj: bpy.types.Object) -> None:
+    if obj.data.type != "PERSP":
+        raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
@@ -154,17 +157,6 @@ def photo_of(obj: bpy.types.Object) -> Path | None:
     stored = imported(obj)
     found = stored is not None and stored.image is not None and trust.is_known_photo(stored.image)
     return stored.image if found else None
-
-
-def has_photo(obj: bpy.types.Object) -> bool:
-    """Whether a camera was imported with a photo that may be used, even if it has been moved away from it since."""
-    return photo_of(obj) is not None
-
-
-def has_strange_photo(obj: bpy.types.Object) -> bool:
-    """Whether a camera names a photo where this user never took photos from, or that is gone."""
-    stored = imported(obj)
-    return stored is not None and stored.image is not None and not has_photo(obj)
 
 
 def is_chart(obj: bpy.types.Object | None) -> bool:
@@ -266,8 +258,8 @@ class ViewSize:
 
     width: int  # pixels
     height: int
-    photo: bool
-    strange_photo: bool  # has one that may not be used
+    photo: bool  # imported with one that may be used, even if it has been moved away from it since
+    strange_photo: bool  # with one where this user never took photos from, or that is gone
     sees: bool  # a part of the boxes may be in its picture; always so of an animation's frames
 
 
@@ -286,19 +278,17 @@ def view_sizes(context: bpy.types.Context, boxes: Iterable[bpy.types.Object] = (
     else:
         cameras, times = chosen_cameras(scene), 1
     for obj in cameras:
-        if obj.data.type != "PERSP":
-            raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
+        _require_perspective(obj)
     animated = settings.views == "ANIMATED"
     corners = [np.array([b.matrix_world @ Vector(c) for c in b.bound_box]) for b in boxes]
-    return [
-        ViewSize(
-            *own_size(obj, scene),
-            has_photo(obj) and not animated,
-            has_strange_photo(obj) and not animated,
-            animated or not corners or any(_may_see(obj, scene, c) for c in corners),
-        )
-        for obj in cameras
-    ] * times
+    found = []
+    for obj in cameras:
+        stored, photo = imported(obj), photo_of(obj)
+        strange = stored is not None and stored.image is not None and photo is None
+        sees = animated or not corners or any(_may_see(obj, scene, c) for c in corners)
+        size = own_size(obj, scene)
+        found.append(ViewSize(*size, photo is not None and not animated, strange and not animated, sees))
+    return found * times
 
 
 def _may_see(

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import bpy
+from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from . import charts, jobs, splats, steps
@@ -162,6 +163,17 @@ class GIMP3D_PT_views(StepPanel, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("gimp3d.look_through", text="Previous", icon="TRIA_LEFT").step = -1
         row.operator("gimp3d.look_through", text="Next", icon="TRIA_RIGHT").step = 1
+
+
+class GIMP3D_OT_add_preset(AddPresetBase, bpy.types.Operator):
+    """Keep the preset, the fill and the seed under a name, or delete the chosen one"""
+
+    bl_idname = "gimp3d.add_preset"
+    bl_label = "Keep Removal Preset"
+    preset_menu = "GIMP3D_PT_presets"
+    preset_subdir = "gimp3d"
+    preset_defines = ("settings = bpy.context.scene.gimp3d",)
+    preset_values = ("settings.preset", "settings.inpaint", "settings.depth_prior", "settings.seed")
 
 
 class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):

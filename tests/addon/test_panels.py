@@ -71,7 +71,7 @@ def drawn() -> list[str]:
     """Every text, property and operator of the tab."""
     log: list[str] = []
     for cls in classes_of(panels):
-        if cls is not panels.GIMP3D_PT_presets:  # the menu is Blender's own
+        if issubclass(cls, bpy.types.Panel) and cls is not panels.GIMP3D_PT_presets:  # that menu is Blender's own
             Drawable(cls, log).draw()
     return log
 
