@@ -52,7 +52,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small scene as files: scene.ply, transforms.json with its photos, roi.json."""
     folder, gaussians = tmp_path_factory.mktemp("docs"), scene()
     write_gaussians(folder / "scene.ply", gaussians)
-    views = [replace(c, id=f"{k}.png") for k, c in enumerate(cameras(4, 60, 45))]
+    views = [replace(c, id=f"{k}.png") for k, c in enumerate(cameras(3, 60, 45))]
     for camera in views:
         write_png(folder / camera.id, render_bytes(gaussians, camera))
     write_transforms(folder / "transforms.json", views)
@@ -78,7 +78,7 @@ def test_a_public_functions_example_runs(function: Any) -> None:
 
 def test_the_librarys_page_runs(files: Path) -> None:
     gaussians = scene()
-    camera = replace(cameras(4, 60, 45)[0], id="0.png")
+    camera = replace(cameras(3, 60, 45)[0], id="0.png")
     upper = gaussians.means[:, 2] > 0.1
     names: dict[str, Any] = {
         "gaussians": gaussians, "camera": camera, "photo": np.zeros((45, 60, 3), np.float32),
