@@ -29,24 +29,20 @@ from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .job import SHADOWS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
-from .pipeline import (
-    PRESETS,
-    STORED,
-    RemovalResult,
-    RemovalSettings,
-    View,
-    preview,
-    remove_object,
-    render_bytes,
-    with_charts,
-)
+from .pictures import of_light
+from .pipeline import PRESETS, RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
+from .run import Run
 from .schema import within
 from .stages.charts import Chart, chart_number
+from .stages.completion import charts_to_paint
+from .stages.light import NOT_LIT
 from .stages.masks import MaskSettings, find_masks
 from .store import StageStore
+from .stored import STORED
+from .view_state import ViewState
 
 PASSES = ("rgb", "alpha", "depth", "normal")
 
@@ -227,7 +223,13 @@ def write_masks(
         _read_marks("--extra-masks", extra_masks, looked_at),
     )
     marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
-    found, charts, lit = with_charts(gaussians, region, found, photos, settings, marked)
+    views: dict[str, ViewState] = {}
+    charts: tuple[Chart, ...] = ()
+    lit = NOT_LIT
+    if found.removed.any():
+        behind = look_behind(Run(settings, progress), gaussians, region, found, photos, marked or {})
+        views = {v.id: v for v in behind.views}
+        charts, lit = charts_to_paint(behind.charts, behind.views), behind.lit
     if pictures:
         proposed = json.dumps(_proposed(found.proposed, frame))
         write_atomically(pictures / "proposed.json", lambda f: f.write(proposed.encode()))
@@ -236,15 +238,15 @@ def write_masks(
         write_atomically(pictures / "light.json", lambda f: f.write(light.encode()))
     if pictures and all(c.split == "train" for c in written):
         write_charts(pictures / "charts", _charts_back(charts, frame))
-    views = {v.camera.id: v for v in found.views}
     for camera in written:
         view = views.get(camera.id)
         empty = np.zeros((camera.height, camera.width), bool)
         target = out / output_name(camera.id)
-        write_png(target.with_name(target.name + ".png"), view.target if view else empty)
+        write_png(target.with_name(target.name + ".png"), view.masks.target if view else empty)
         if pictures and view:
             target = pictures / output_name(camera.id)
-            for looked in (*preview(view, found.views, photos[camera.id], settings), *lit.pictures(found.views, view)):
+            shown = preview(view, list(views.values()), settings)
+            for looked in (*shown, *of_light(lit, list(views), [camera.id])):
                 write_png(target.with_name(f"{target.name}.{looked.kind}.png"), draw(looked))
 
 

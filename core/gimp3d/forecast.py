@@ -25,7 +25,7 @@ STAGES = {
     "appearance": (0.11, 0.004, 0.0),
     "mapping": (0.026, 0.012, 0.001),
     "propagate": (0.336, 0.069, 0.024),
-    "seed": (0.057, 0.022, 0.031),
+    "settle": (0.057, 0.022, 0.031),
     "verdict": (0.274, 0.048, 0.044),
 }
 STEP = (0.00063, 0.04108)  # s of a step of refinement: constant, for each million pixels of a view

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
 
-from gimp3d import pipeline
+from gimp3d import filling, pipeline
 from gimp3d.camera import output_name
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
@@ -122,7 +122,7 @@ def test_json_progress_ends_with_the_summary(
     remove(scene_folder, tmp_path / "out.ply", "--progress", "json")
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert all({"stage", "done", "total", "message"} <= set(line) for line in lines[:-1])
-    assert {"masks", "charts", "mapping", "propagate", "seed"} <= {line["stage"] for line in lines}
+    assert {"masks", "charts", "mapping", "propagate", "seed", "settle"} <= {line["stage"] for line in lines}
     assert lines[-1]["stage"] == "done" and lines[-1]["summary"]["counts"]["removed"] > 0
 
 
@@ -139,8 +139,10 @@ def test_a_job_runs_alone_moves_and_resumes(
     (job / "out.ply").unlink()
     moved = tmp_path / "moved"
     job.rename(moved)
-    for stage in ("find_masks", "_chart", "mapping_field", "propagate", "settle_gaussians", "judge"):
+    for stage in ("find_masks", "exposures_of", "find_surfaces", "find_light", "chart_surfaces", "judge"):
         monkeypatch.setattr(pipeline, stage, again)
+    for stage in ("paint_chart", "seed_surface", "map_reference", "paint_views", "settle_seeds", "refine_gaussians"):
+        monkeypatch.setattr(filling, stage, again)
     assert main(["remove", "--job", str(moved), "--resume", "--progress", "none"]) == 0
     assert (moved / "out.ply").read_bytes() == first
     assert json.loads((moved / "summary.json").read_text())["counts"]["added"] > 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from scenes import REGION, cameras, scene
 
-from gimp3d import pipeline
+from gimp3d import filling
 from gimp3d.errors import IllPosed
 from gimp3d.evaluate.benchmark import run_benchmark
 from gimp3d.pipeline import RemovalSettings, View, remove_object, render_bytes
@@ -31,10 +31,10 @@ def test_a_negligible_hole_that_no_view_can_fill_does_not_stop_a_removal(monkeyp
     def none(*_: object) -> None:
         raise IllPosed("no view shows it")
 
-    monkeypatch.setattr(pipeline, "choose_reference", none)
+    monkeypatch.setattr(filling, "choose_reference", none)
     with pytest.raises(IllPosed, match="no view shows it"):
         remove_object(scene(), views(), REGION, RemovalSettings(charts=None))
-    monkeypatch.setattr(pipeline, "NEGLIGIBLE", 1.0)
+    monkeypatch.setattr(filling, "NEGLIGIBLE", 1.0)
     done = remove_object(scene(), views(), REGION, RemovalSettings(charts=None))
     assert done.added is None and not done.keep.all() and done.open_pixels == done.hole_pixels > 0
     assert any("no view shows it" in w for w in done.warnings) and any("stay open" in w for w in done.warnings)

@@ -703,7 +703,7 @@ def test_shadows_can_be_named_and_go(case: str, remove: Remove) -> None:
         assert kept < 0.8 * true and abs(gone - true) < 0.1 * (true - kept)
 
 
-STAGES = ("read", "masks", "charts", "appearance", "mapping", "propagate", "seed")
+STAGES = ("read", "masks", "charts", "appearance", "seed", "mapping", "propagate", "settle")
 OLD = b"an older result"
 
 
@@ -758,7 +758,7 @@ def test_a_crashed_run_goes_on_where_it_was(case: str, remove: Remove, monkeypat
     (folder / "summary.json").unlink()
     old_result(folder)
     job = folder.parent / "job"
-    crash = "import os, gimp3d.pipeline as p; p.mapping_field = lambda *a, **b: os._exit(9)"
+    crash = "import os, gimp3d.filling as f; f.map_reference = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
     monkeypatch.setattr(pipeline, "find_masks", again)

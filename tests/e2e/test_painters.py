@@ -18,7 +18,7 @@ from pictures import disc, holed, scenery
 from scenes import REGION, cameras, scene
 from stand_ins import Automatic, Comfy, Gemini, StandIn, big_lama, depth_model, serving
 
-from gimp3d import commands, pipeline
+from gimp3d import commands, filling, pipeline
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
@@ -185,18 +185,18 @@ def test_painted_and_refined_views_reach_the_splats(tmp_path: Path, monkeypatch:
     refine = written(folder, "refine.py", body)
     before: dict[str, np.ndarray] = {}
     seen: dict[str, Any] = {}  # by ID, what the splats are fitted to
-    ask, fit = pipeline._views_refined, pipeline.refine_gaussians
+    ask, fit = filling.ask_to_refine, filling.refine_gaussians
 
-    def asked(run: Any, masks: Any, painted: dict[str, np.ndarray], *rest: Any) -> Any:
-        before.update({name: view.astype(int) for name, view in painted.items()})
-        return ask(run, masks, painted, *rest)
+    def asked(views: Any, *rest: Any) -> Any:
+        before.update({v.id: v.painted.astype(int) for v in views})
+        return ask(views, *rest)
 
     def fitted(kept: Any, added: Any, views: Any, *rest: Any) -> Any:
         seen.update({v.camera.id: v for v in views})
         return fit(kept, added, views, *rest)
 
-    monkeypatch.setattr(pipeline, "_views_refined", asked)
-    monkeypatch.setattr(pipeline, "refine_gaussians", fitted)
+    monkeypatch.setattr(filling, "ask_to_refine", asked)
+    monkeypatch.setattr(filling, "refine_gaussians", fitted)
     few = ("--set", "refine.steps=2", "--inpaint", paint, "--report", str(folder / "report"))
     assert remove(folder, *few, "--refine-views", refine) == 0
     summary = json.loads((folder / "s.json").read_text())

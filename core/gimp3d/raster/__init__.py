@@ -44,6 +44,7 @@ __all__ = [
     "label_weights",
     "pixel_region",
     "render",
+    "render_bytes",
     "surface_depth",
     "touched_window",
     "trace",
@@ -83,6 +84,17 @@ def render(
     ((45, 60, 3), True)
     """
     return current_backend().render(gaussians, camera, settings, passes, pixels)
+
+
+def render_bytes(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: tuple[float, float, float] = (0, 0, 0),
+    pixels: np.ndarray | None = None,  # [H, W] bool, those that are wanted
+) -> np.ndarray:
+    """The scene as 8-bit RGB, [H, W, 3]."""
+    rgb = render(gaussians, camera, RasterSettings(background=background), frozenset({"rgb"}), pixels).rgb
+    return np.clip(np.rint(rgb * 255), 0, 255).astype(np.uint8)
 
 
 def trace(

@@ -22,7 +22,7 @@ from .regularity import continue_regularly, find_motions
 from .surface import Surface, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in
+OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
@@ -102,7 +102,9 @@ def complete_picture(
         barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
         rounds = 1 if number else settings.coarse_rounds
         finest = number == len(levels) - 1
-        level = _prepared(channels, open_, barred, there, radius, min(radius, OWN) if finest else radius, settings)
+        # … but the average is what makes up for their resampling where they are warped along a surface.
+        reach = min(radius, OWN) if finest and surface is None else radius
+        level = _prepared(channels, open_, barred, there, radius, reach, settings)
         colours, field = _filled(level, field, rounds, settings)
     assert field is not None
     sources = image[field.rows[hole], field.cols[hole]]

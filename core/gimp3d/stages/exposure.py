@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from ..compute.threads import parallel_map
+from ..gaussians import Gaussians
+from ..raster import render_bytes
 from ..solvers.colours import exposure_gain
 from .masks import ViewMasks
 
@@ -19,10 +23,13 @@ MAX_GAIN = 3.0  # what is beyond is no exposure
 
 @dataclass(frozen=True)
 class Exposure:
-    """A photo at the splats' exposure."""
+    """A photo's exposure over the splats'."""
 
-    image: np.ndarray  # [H, W, 3] uint8; the photo itself if its gain is 1
-    gain: np.ndarray  # [3], the photo's exposure over the splats'
+    gain: np.ndarray  # [3]; 1 where no gain clearly fits better
+
+    def level(self, photo: np.ndarray) -> np.ndarray:
+        """A photo [H, W, 3] uint8 at the splats' exposure; the photo itself if its gain is 1."""
+        return photo if (self.gain == 1).all() else _times(photo, 1 / self.gain)
 
     def back(
         self,
@@ -32,6 +39,31 @@ class Exposure:
     ) -> np.ndarray:
         """The photo with the picture, at the photo's exposure, where it was changed."""
         return np.where(changed[..., None], _times(picture, self.gain), photo)
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """Every view's, in the views' order."""
+
+    views: tuple[Exposure, ...]
+    confidence: float
+    reason: str
+
+
+def exposures_of(
+    kept: Gaussians,  # the scene without the object
+    views: Sequence[ViewMasks],
+    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8
+) -> Exposures:
+    """Compare photos with the splats round the object."""
+
+    def compare(view: ViewMasks) -> Exposure:
+        ring = exposure_ring(view)
+        return level_exposure(ring, photos[view.camera.id], render_bytes(kept, view.camera, pixels=ring))
+
+    found = tuple(parallel_map(compare, views))
+    levelled = sum(bool((e.gain != 1).any()) for e in found)
+    return Exposures(found, 1.0, f"{levelled} of {len(found)} photos are brought to the splats' exposure")
 
 
 def exposure_ring(view: ViewMasks) -> np.ndarray:
@@ -49,14 +81,14 @@ def level_exposure(
     photo: np.ndarray,  # [H, W, 3] uint8
     drawn: np.ndarray,  # [H, W, 3] uint8, the splats without the object; only the ring is looked at
 ) -> Exposure:
-    """Divide a photo by its gain over the splats, measured round the object, if that clearly fits better."""
-    unchanged = Exposure(photo, np.ones(3))
+    """A photo's gain over the splats, measured round the object, if dividing by it clearly fits better."""
+    unchanged = Exposure(np.ones(3))
     gain = exposure_gain(drawn[ring], photo[ring])
     if (gain > MAX_GAIN).any() or (gain < 1 / MAX_GAIN).any():
         return unchanged
     level = _times(photo[ring], 1 / gain)
     if _difference(level, drawn[ring]) < CLEARLY * _difference(photo[ring], drawn[ring]) - MARGIN:
-        return Exposure(_times(photo, 1 / gain), gain)
+        return Exposure(gain)
     return unchanged
 
 

@@ -49,11 +49,11 @@ def test_another_exposure_is_taken_out_and_put_back(gain: float) -> None:
 def test_a_photo_of_the_splats_exposure_stays_bit_for_bit(noise: float) -> None:
     photo = np.clip(drawn() + np.random.default_rng(5).normal(0, noise, (*SHAPE, 3)), 0, 255).astype(np.uint8)
     found = level_exposure(exposure_ring(view()), photo, drawn())
-    assert found.image is photo and (found.gain == 1).all()
+    assert found.level(photo) is photo and (found.gain == 1).all()
 
 
 def test_a_photo_of_something_else_is_left_as_it_is() -> None:
     photo = np.random.default_rng(6).integers(0, 255, (*SHAPE, 3)).astype(np.uint8)
-    assert level_exposure(exposure_ring(view()), photo, drawn()).image is photo
+    assert level_exposure(exposure_ring(view()), photo, drawn()).level(photo) is photo
     dark = (drawn() // 16).astype(np.uint8)
-    assert level_exposure(exposure_ring(view()), dark, drawn()).image is dark
+    assert level_exposure(exposure_ring(view()), dark, drawn()).level(dark) is dark

@@ -10,12 +10,12 @@ import pytest
 from pictures import disc, error, scenery
 
 from gimp3d.errors import BadInput
-from gimp3d.pipeline import STORED
 from gimp3d.priors.appearance import Painter, surroundings
 from gimp3d.priors.calls import Call
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
 from gimp3d.store import StageStore
+from gimp3d.stored import STORED
 
 TRUTH, HOLE = scenery(120, 160), disc()
 REFERENCE = scenery(90, 200, seed=1)

@@ -1,0 +1,168 @@
+"""The hole filled: one reference after the other is completed and carried into every view, then the whole refined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from . import pictures
+from .compute import buffers
+from .errors import IllPosed
+from .gaussians import Gaussians
+from .geometry import SAME_DEPTH, SOLID
+from .run import Run, counted
+from .stages.carrying import (
+    as_reference,
+    map_reference,
+    paint_views,
+    seed_surface,
+    settle_seeds,
+    snapped,
+    with_own_picture,
+)
+from .stages.charts import Chart
+from .stages.completion import (
+    Completed,
+    Turn,
+    carried_over,
+    complete_view_depth,
+    paint_chart,
+    paint_view,
+    texels_to_fill,
+)
+from .stages.coverage import after_reference, emptied
+from .stages.propagate import Reference
+from .stages.reference import choose_reference
+from .stages.refine import observed, refine_gaussians
+from .stages.view_refinement import ask_to_refine, with_answers
+from .view_state import ViewState, open_pixels
+
+NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
+REFINING = 0.5  # share of a painted hole that a refining painter may change (img2img's denoising strength)
+
+
+@dataclass(frozen=True)
+class Filling:
+    """How far the hole is filled."""
+
+    kept: Gaussians  # the scene without the object
+    views: tuple[ViewState, ...]
+    added: Gaussians | None = None
+    done: tuple[Reference, ...] = ()  # completed references
+    asked: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts
+
+    @property
+    def filled(self) -> Gaussians:
+        return self.kept if self.added is None else self.kept.extended(self.added)
+
+
+def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequence[Turn]) -> Filling:
+    """Complete one reference after the other and carry it into every view, until little is left open."""
+    hole = open_pixels(filling.views)
+    touched = sum(int(v.masks.silhouette.sum()) for v in filling.views)
+    if turns[0].chart is not None and turns[0].name and run.settings.depth_prior != "auto":
+        run.warnings.append(f"--depth-prior {run.settings.depth_prior} is not used: the reference is a chart")
+    filling = replace(filling, views=emptied(filling.kept, filling.views))
+    for number, turn in enumerate(turns):
+        if number and open_pixels(filling.views) < run.settings.extra_gain * hole:
+            break
+        buffers.release()  # one stage's arrays are of little use to the next
+        suffix = f" {number + 1}" if number else ""
+        try:
+            if turn.chart is None:
+                completed = _complete_view(run, filling, charts, turn, suffix)
+            elif (of_chart := _complete_chart(run, filling, charts[turn.chart], turn, suffix)) is not None:
+                completed = of_chart
+            else:
+                if turn.name:
+                    run.warnings.append(f"--reference {turn.name}: no view needs this chart, it is not used")
+                continue
+            filling = _carry(run, filling, completed, suffix)
+        except IllPosed as error:
+            if not number and hole > NEGLIGIBLE * touched:
+                raise
+            run.warnings.append(f"no {'further ' if number else ''}reference view helps: {error}")
+            break
+    return filling
+
+
+def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix: str) -> Completed | None:
+    """One chart without its hole; None if no view needs it."""
+    assert turn.chart is not None
+    chart = carried_over(chart, filling.done)
+    target, hole = texels_to_fill(chart, turn.chart, filling.views)
+    if not target.any():
+        return None
+    name = f"appearance{suffix}"
+    appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
+    run.warnings += appearance.warnings
+    return Completed(chart.camera, appearance, chart.depth, target, ~target & ~hole & chart.known, (chart,))
+
+
+def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed:
+    """One view without the object; the program chooses it unless the user named one."""
+    settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
+    masks = [v.left for v in views]
+    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, SOLID, settings.reference, tried)
+    run.references.append(choice)
+    view = next(v for v in views if v.id == choice.camera_id)
+    name, first = f"depth{suffix}", not suffix
+    calls = run.call("--inpaint", name), run.call("--depth-prior", name)
+    completion = run(name, complete_view_depth, view, views, settings, turn.picture, first, *calls)
+    depth = np.where(view.left.target, completion.depth, view.left.depth_after).astype(np.float32)
+    # Where drawn surfaces scatter about the charts by more than a z-test allows, the charts tell the depth.
+    rough = any(c.scatter > SAME_DEPTH for c in charts)
+    if rough and view.hits is not None:
+        depth = snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
+    name = f"appearance{suffix}"
+    appearance = run(name, paint_view, view, depth, views, settings, turn.picture, run.call("--inpaint", name))
+    run.warnings += appearance.warnings
+    run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
+    source = ~view.left.target & ~view.left.silhouette & (depth > 0)
+    return Completed(view.camera, appearance, depth, view.left.target, source, charts if rough else ())
+
+
+def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
+    """A completed reference in every view, and the Gaussians that show it."""
+    settings, views, filled = run.settings, filling.views, filling.filled
+    seeds = run(f"seed{suffix}", seed_surface, completed, filled.is_surfels, settings, words=counted)
+    if len(seeds) == 0:
+        name = completed.camera.id
+        raise IllPosed(f"reference {name}: what is behind the object is infinitely far; nothing to build")
+    field_ = run(f"mapping{suffix}", map_reference, completed, views, settings)
+    with_seeds = filled.extended(seeds)
+    name = f"propagate{suffix}"
+    painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
+    run.pictures += pictures.of_reference(completed, field_)
+    run.pictures += pictures.of_painting(painting, views)
+    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
+    shown = [with_own_picture(p, completed) for p in painting.views]
+    added = new if filling.added is None else filling.added.extended(new)
+    reference, filled = as_reference(completed, field_), filling.kept.extended(added)
+    views = after_reference(views, shown, reference, filled, new, len(added), settings.masks)
+    return replace(filling, views=views, added=added, done=(*filling.done, reference))
+
+
+def ask_for_refinement(run: Run, filling: Filling) -> Filling:
+    """The painted views, refined by a painter that sees their reference beside them if the user asked for one."""
+    if not run.settings.refine_views:
+        return filling
+    call = run.call("--refine-views", "refine views", REFINING)
+    asked = run(call.stage, ask_to_refine, filling.views, run.settings, call)
+    run.warnings += asked.warnings
+    run.pictures += pictures.of_refinement(asked, filling.views)
+    facts = {"provider": run.settings.refine_views, **asked.facts()}
+    return replace(filling, views=with_answers(filling.views, asked), asked=facts)
+
+
+def refine(run: Run, filling: Filling) -> Filling:
+    """The new Gaussians, optimised where the settings ask for it."""
+    settings = run.settings
+    if filling.added is None or not settings.refine.steps:
+        return filling
+    seen = [observed(v.camera, v.painted, v.rules) for v in filling.views if v.rules is not None]
+    inputs = filling.kept, filling.added, seen, settings.refine, settings.random_seed, run.progress
+    return replace(filling, added=run("refine", refine_gaussians, *inputs).gaussians)

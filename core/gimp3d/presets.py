@@ -1,0 +1,76 @@
+"""Every stage's settings for a removal, and the presets: how much work is spent, and the paper as it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from .schema import Seed, Share
+from .solvers.harmonics import HarmonicsSettings
+from .stages.charts import ChartSettings
+from .stages.clearing import ClearingSettings
+from .stages.depth import DepthSettings
+from .stages.layers import LayerSettings
+from .stages.mapping import MappingSettings
+from .stages.masks import MaskSettings
+from .stages.propagate import PropagateSettings
+from .stages.reference import EvidenceSettings, ReferenceSettings
+from .stages.refine import RefineSettings
+from .stages.seed import SeedSettings
+from .stages.selection import SelectionSettings
+
+
+@dataclass(frozen=True)
+class RemovalSettings:
+    """Every stage's settings, and the providers of what no view shows."""
+
+    masks: MaskSettings = MaskSettings()
+    charts: ChartSettings | None = ChartSettings()  # None: photos are the only references (paper)
+    clearing: ClearingSettings = ClearingSettings()
+    reference: ReferenceSettings = ReferenceSettings()
+    evidence: EvidenceSettings = EvidenceSettings()
+    depth: DepthSettings = DepthSettings()
+    mapping: MappingSettings = MappingSettings()
+    propagate: PropagateSettings = PropagateSettings()
+    seed: SeedSettings = SeedSettings()
+    refine: RefineSettings = RefineSettings()
+    inpaint: str = "exemplar"  # provider; who paints what no photo shows
+    depth_prior: str = "auto"  # provider; where the depth behind the object comes from
+    shadow: Literal["auto", "off", "mask"] = "auto"  # look for the object's shadow, leave it, or undo the marked one
+    use_evidence: bool = True  # copy what photos show of the hidden surface before the rest is invented
+    extra_references: int = 3  # views; completed after the first one, where it does not reach
+    extra_gain: Share = 0.01  # share of the hole; that must still be open for an extra reference
+    random_seed: Seed = 0  # number; another one gives another texture
+    refine_views: str = ""  # provider; who is asked to refine painted views beside their reference, empty: nobody
+    painter_seconds: float = 600.0  # s; that a painter or model outside this program may take for one picture
+    prompt: str = ""  # words; what stands behind the object, for painters that read
+
+
+PRESETS: dict[str, RemovalSettings] = {
+    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
+    "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
+    "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
+    "paper": RemovalSettings(
+        masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
+        charts=None,
+        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layers=LayerSettings(step=1e9)),
+        mapping=MappingSettings(geometry=False),
+        propagate=PropagateSettings(transfer="sample", blend="rim"),
+        seed=SeedSettings(
+            largest=1, sink=0, needed=0, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)
+        ),
+        refine=RefineSettings(steps=3000, patience=120),
+        shadow="off",
+        use_evidence=False,
+        extra_references=0,
+    ),
+}
+# The paper as it is printed: the signs of the guidance (told only with a depth prior) and of the visibility, the patch
+# cost without p, SH that are not anchored and lack 3DGS's 0.5. Of several levels, the finest first gives no field.
+_PAPER = PRESETS["paper"]
+PRESETS["paper-literal"] = replace(
+    _PAPER,
+    depth=replace(_PAPER.depth, scale_factor=-0.1),
+    mapping=replace(_PAPER.mapping, visibility=-_PAPER.mapping.visibility, as_printed=True),
+    seed=replace(_PAPER.seed, grey=0.0, harmonics=replace(_PAPER.seed.harmonics, anchored=False)),
+)

@@ -1,0 +1,213 @@
+"""A reference without the object: which chart or view comes next, its depth, and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy.ndimage
+
+from ..camera import Camera
+from ..errors import BadInput
+from ..geometry import SOLID
+from ..presets import RemovalSettings
+from ..priors.appearance import Appearance
+from ..priors.calls import Call
+from ..priors.inpaint import inpaint_reference
+from ..priors.monodepth import depth_prior, looks
+from ..priors.pasting import paste_picture
+from ..view_state import ViewState
+from .charts import CHART, Chart, chart_number
+from .depth import DepthCompletion, complete_depth
+from .masks import sees
+from .propagate import Reference
+from .reference import disparity_of, gather_evidence, rim
+
+SAME = 0.01  # relative z within which two references show the same surface
+SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What is completed next."""
+
+    chart: int | None = None  # index of a chart; None: a view
+    name: str | None = None  # ID of the view, or the chart's name, if the user gave one
+    picture: np.ndarray | None = None  # [H, W, 3] uint8, what the user gave for it
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A reference without the object; arrays [H, W] of its camera."""
+
+    camera: Camera
+    appearance: Appearance
+    depth: np.ndarray  # float32 z of the completed surface
+    target: np.ndarray  # bool, what views need of what was completed
+    source: np.ndarray  # bool, what photos show of the surface round it
+    charts: tuple[Chart, ...]  # that views take their depths from; none: from their splats
+
+
+def turns_of(
+    reference: str | None, picture: np.ndarray | None, charts: Sequence[Chart], settings: RemovalSettings
+) -> list[Turn]:
+    """In which order references are completed, as far as there is something left to fill.
+
+    Raises
+    ------
+    BadInput
+        If the chart that is named does not exist.
+    """
+    named = _named_chart(reference, charts, settings)
+    if named is not None:
+        return [Turn(named, reference, picture), *(Turn(k) for k in range(len(charts)) if k != named)]
+    # A depth prior, or a file that fills, belongs to a view and needs that view.
+    of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
+    views = [Turn(None, reference, picture), *[Turn()] * settings.extra_references]
+    return [*(views if not charts or reference is not None or of_view else []), *map(Turn, range(len(charts)))]
+
+
+def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
+    """The index of the chart that the reference names; None if it names a view, or nothing."""
+    number = chart_number(reference)
+    if number is None:
+        return None
+    if not charts:
+        why = "photos are the only references of this preset" if settings.charts is None else "no chart is found here"
+        raise BadInput(f"--reference {reference}: {why}; name a view")
+    if not 1 <= number <= len(charts):
+        there = (
+            "is 1 chart, chart:1" if len(charts) == 1 else f"are {len(charts)} charts, chart:1 to chart:{len(charts)}"
+        )
+        raise BadInput(f"--reference {reference}: there {there}")
+    return number - 1
+
+
+def charts_to_paint(charts: Sequence[Chart], views: Sequence[ViewState]) -> tuple[Chart, ...]:
+    """The charts as a user gets them: the hole is all that a picture of one has to show."""
+    return tuple(replace(c, hole=c.hole | texels_to_fill(c, number, views)[1]) for number, c in enumerate(charts))
+
+
+def texels_to_fill(chart: Chart, number: int, views: Sequence[ViewState]) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool each: texels that views need, and those that are filled for that, as no photo shows them well."""
+    marked = np.zeros(chart.hole.shape, np.uint8)
+    for view in views:
+        assert view.hits is not None
+        on = view.left.target & (view.hits.chart == number)
+        marked[view.hits.rows[on], view.hits.cols[on]] = 1
+    # A view that looks on from the side or from afar has fewer pixels than the chart has texels.
+    kernel = np.ones((5, 5), np.uint8)
+    closed = cv2.morphologyEx(marked, cv2.MORPH_CLOSE, kernel) > 0
+    needed = (closed | (chart.hole & (cv2.dilate(marked, kernel) > 0))) & chart.there
+    target = needed | (scipy.ndimage.binary_fill_holes(needed) & chart.hole)
+    return target, target & (chart.hole | (chart.photos == 0))
+
+
+def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
+    """The chart with what completed references show of its hole: a picture that was given rules where it sees it."""
+    points = chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(np.float64))
+    for reference in done:
+        open_points = np.argwhere(chart.hole)
+        if not len(open_points):
+            break
+        rows, cols = open_points.T
+        uv, _ = reference.camera.project(points[rows, cols])
+        same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
+        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], same)
+        x, y = np.where(seen[:, None], uv, 0).astype(np.float32).T[:, :, None] - np.float32(0.5)
+        colours = cv2.remap(reference.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
+        photos = chart.photos.copy()
+        shown = rows[seen], cols[seen]
+        image[shown], known[shown], hole[shown], photos[shown] = colours[seen], True, False, 1
+        chart = replace(chart, image=image, known=known, hole=hole, photos=photos)
+    return chart
+
+
+def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSettings, call: Call) -> Appearance:
+    """The chart without its hole: the given picture, or the provider's fill."""
+    if turn.picture is not None:
+        return paste_picture(chart.image, hole | chart.hole, turn.picture, "--reference-image", chart.known)
+    of_another = settings.inpaint.startswith("file:") and turn.name is None
+    return inpaint_reference(
+        "exemplar" if of_another else settings.inpaint,
+        chart.image,
+        hole,
+        settings.random_seed,
+        None if chart.kind == "plane" else disparity_of(chart.depth),
+        chart.camera.K,
+        ~chart.known & ~hole,
+        call,
+    )
+
+
+def complete_view_depth(
+    view: ViewState,
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+    picture: np.ndarray | None,
+    first: bool,  # reference; a file's prior is of that view
+    painter: Call,
+    model: Call,
+) -> DepthCompletion:
+    """The reference's depth: the charts', unless the user has another prior.
+
+    A model that estimates it looks at the picture given, or at a first fill.
+    """
+    masks = view.left
+    if view.hits is not None and settings.depth_prior == "auto":
+        there = view.hits.depth
+        depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
+        share = float((there[masks.target] > 0).mean())
+        known, no_ring = np.ones(depth.shape, np.float32), np.zeros((0, 2), np.float32)
+        words = f"{share:.0%} of the hole lies on charts"
+        return DepthCompletion(disparity_of(depth), depth, known, 0.0, no_ring, (0.0, 0.0), 0, 0, share, words)
+    looked_at, spec = None, settings.depth_prior
+    if spec.startswith("file:") and not first:
+        spec = "auto"
+    if looks(spec):
+        if picture is not None:
+            pasted = paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette)
+        else:
+            pasted = inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=painter)
+        looked_at = pasted.image
+    prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
+    surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
+    depth_settings = replace(settings.depth, surface=surface)
+    others = [v.left for v in views]
+    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks, SOLID), prior, depth_settings)
+
+
+def paint_view(
+    view: ViewState,
+    depth: np.ndarray,  # [H, W] z of the completed reference
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+    picture: np.ndarray | None,
+    call: Call,
+) -> Appearance:
+    """The view without the object: the given picture, or what photos show and the provider's fill for the rest."""
+    masks, base = view.left, view.painted
+    if picture is not None:
+        return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
+    seen = np.zeros_like(masks.target)
+    if settings.use_evidence:
+        # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
+        sources = ((v.camera, v.bare, np.where(v.left.silhouette, 0, v.left.depth_before)) for v in views)
+        evidence = gather_evidence(masks.camera, depth, masks.target, sources, settings.evidence)
+        seen = evidence.seen
+        base = np.where(seen[..., None], evidence.image, base)
+    filled = inpaint_reference(
+        settings.inpaint,
+        base,
+        masks.target & ~seen,
+        settings.random_seed,
+        disparity_of(depth),
+        masks.camera.K,
+        call=call,
+    )
+    share = seen.sum() / max(1, masks.target.sum())
+    return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")

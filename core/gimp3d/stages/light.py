@@ -1,0 +1,145 @@
+"""What the object does to the light round it: its shadow and its reflection, found and undone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..box import Region
+from ..gaussians import Gaussians
+from ..presets import RemovalSettings
+from ..result import RemovalResult
+from ..view_state import ViewState
+from .ground import look_at
+from .lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
+from .masks import Masks
+from .reflection import Reflection, find_reflection
+from .shadow import Shadow, find_shadow, marked_shadow
+from .surfaces import Surfaces
+from .witness import Witness
+
+NOT_LOOKED_FOR = "not looked for"
+NO_SHADOW = {"found": False, "lights": [], "explained": 0.0}
+NO_REFLECTION = {"found": False, "explained": 0.0}
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the object does to the light round it, as far as it is found."""
+
+    reflection: Reflection | None
+    why_reflection: str
+    shadow: Shadow | None
+    why_shadow: str
+
+    @classmethod
+    def of(cls, reflection: Reflection | str, shadow: Shadow | str) -> Found:
+        one = (None, reflection) if isinstance(reflection, str) else (reflection, reflection.reason)
+        other = (None, shadow) if isinstance(shadow, str) else (shadow, shadow.reason)
+        return cls(*one, *other)
+
+    @property
+    def anything(self) -> bool:
+        return self.reflection is not None or self.shadow is not None
+
+    @property
+    def confidence(self) -> float:
+        return min((f.confidence for f in (self.reflection, self.shadow) if f is not None), default=0.0)
+
+    @property
+    def reason(self) -> str:
+        return f"{self.why_shadow}; {self.why_reflection}"
+
+
+def find_light(
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    surfaces: Surfaces,
+    views: Sequence[ViewState],
+    shadow_masks: Mapping[str, np.ndarray],  # ID → [H, W] bool, the shadow as the user marked it
+    settings: RemovalSettings,
+) -> Found:
+    """Look for the object's reflection, and in photos without that for its shadow."""
+    planes = surfaces.planes
+    if not planes:
+        none = "no surface is known round the object"
+        return Found(None, f"no reflection found: {none}", None, f"no shadow found: {none}")
+    witnesses: Sequence[Witness] = surfaces.witnesses(views)
+    grounds, gone = look_at(planes, masks.views, witnesses, region), scene.take(masks.removed)
+    reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
+    if isinstance(reflection, Reflection):
+        bare = bare_photos(reflection, witnesses)
+        witnesses = [replace(w, photo=photo) for w, (photo, _, _) in zip(witnesses, bare)]
+        grounds = look_at(planes, masks.views, witnesses, region)
+    if settings.shadow == "mask":
+        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
+    else:
+        shadow = find_shadow(gone, planes, grounds, region)
+    return Found.of(reflection, shadow)
+
+
+def undo_light(scene: Gaussians, masks: Masks, surfaces: Surfaces, views: Sequence[ViewState], found: Found) -> Lifted:
+    """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
+    witnesses: Sequence[Witness] = surfaces.witnesses(views)
+    first = None
+    if found.reflection is not None:
+        first = subtract_reflection(scene, masks.removed, found.reflection, witnesses)
+        scene, witnesses = first.scene(scene), [replace(w, photo=p) for w, p in zip(witnesses, first.photos)]
+    if found.shadow is None:
+        assert first is not None
+        return first
+    lifted = lift_shadow(scene, masks.removed, found.shadow, witnesses)
+    return lifted if first is None else lifted.after(first)
+
+
+@dataclass(frozen=True)
+class Relit:
+    """What the object does to the light round it undone, or why it is not."""
+
+    lifted: Lifted | None
+    shadow: dict[str, Any]  # see Shadow.facts
+    reflection: dict[str, Any]  # see Reflection.facts
+
+    @classmethod
+    def of(cls, found: Found, lifted: Lifted | None) -> Relit:
+        shadow, reflection = (
+            {**(what.facts() if what is not None else none), "reason": why}
+            for what, why, none in (
+                (found.shadow, found.why_shadow, NO_SHADOW),
+                (found.reflection, found.why_reflection, NO_REFLECTION),
+            )
+        )
+        return cls(lifted, shadow, reflection)
+
+    def scene(self, scene: Gaussians) -> Gaussians:
+        """The scene in its new light."""
+        return scene if self.lifted is None else self.lifted.scene(scene)
+
+    def views(self, views: Sequence[ViewState]) -> tuple[ViewState, ...]:
+        """The views in it."""
+        if self.lifted is None:
+            return tuple(views)
+        return tuple(replace(v, bare=photo, painted=photo) for v, photo in zip(views, self.lifted.photos))
+
+    def shaded(self, number: int) -> np.ndarray | bool:
+        """[H, W] bool: where a view, by its index, changed."""
+        return False if self.lifted is None else self.lifted.shaded[number]
+
+    def with_changes(self, result: RemovalResult, scene: Gaussians) -> RemovalResult:
+        """The result with the Gaussians whose light changed: as any changed row, they are removed and added."""
+        result = replace(result, shadow=self.shadow, reflection=self.reflection)
+        if self.lifted is None or not len(self.lifted.rows):
+            return result
+        changed = np.zeros(len(scene), bool)
+        changed[self.lifted.rows] = True
+        changed &= result.keep  # some were taken away since
+        relit = self.lifted.scene(scene).take(changed)
+        added = relit if result.added is None else relit.extended(result.added)
+        return replace(result, keep=result.keep & ~changed, added=added, lifted=int(changed.sum()))
+
+
+NOT_LIT = Relit(None, {**NO_SHADOW, "reason": NOT_LOOKED_FOR}, {**NO_REFLECTION, "reason": NOT_LOOKED_FOR})

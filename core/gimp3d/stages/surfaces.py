@@ -1,0 +1,84 @@
+"""The surfaces behind the object: the planes that run in behind it, their charts, the air before them, and T."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..box import Region
+from ..gaussians import Gaussians
+from ..presets import RemovalSettings
+from ..view_state import ViewState
+from .charts import Chart, Plane, draw_charts, find_planes
+from .clearing import Targets, chart_targets, clear_air, object_pixels
+from .masks import Masks
+from .selection import Selection
+from .witness import Witness
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What is round the object, and where photos show it; tuples are of the masks' views."""
+
+    planes: tuple[Plane, ...]
+    objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
+    marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
+    confidence: float
+    reason: str
+
+    def witnesses(self, views: Sequence[ViewState]) -> list[Witness]:
+        return [
+            Witness(v.camera, v.bare, hidden | marked, beside, v.masks.depth_before)
+            for v, (hidden, beside), marked in zip(views, self.objects, self.marked)
+        ]
+
+    def with_marked(self, more: Sequence[np.ndarray]) -> Surfaces:
+        return replace(self, marked=tuple(a | b for a, b in zip(self.marked, more)))
+
+
+def find_surfaces(
+    scene: Gaussians, region: Region, masks: Masks, views: Sequence[ViewState], settings: RemovalSettings
+) -> Surfaces:
+    """The planes that run into what the object hid."""
+    assert settings.charts is not None
+    # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
+    marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
+    objects = tuple(object_pixels(scene, masks.removed, masks.views, settings.clearing))
+    found = Surfaces((), objects, marked, 1.0, "")
+    planes = find_planes(masks.views, found.witnesses(views), region, settings.charts)
+    return replace(found, planes=planes, reason=f"{len(planes)} planes run into what the object hid")
+
+
+@dataclass(frozen=True)
+class Charted:
+    """The surfaces that the object hid, seen straight on, and what follows from them."""
+
+    charts: tuple[Chart, ...]
+    selection: Selection  # with what had to be cleared away
+    targets: Targets
+    confidence: float
+    reason: str
+
+
+def chart_surfaces(
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    surfaces: Surfaces,
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+) -> Charted:
+    """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
+    assert settings.charts is not None
+    witnesses, marked = surfaces.witnesses(views), surfaces.marked
+    charts = draw_charts(surfaces.planes, masks.views, witnesses, region, settings.charts, marked)
+    if not charts:
+        return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
+    tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
+    selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, scatter, settings.clearing)
+    targets = chart_targets(scene, selection, masks.views, witnesses, charts, tolerance, marked, settings.clearing)
+    words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
+    cleared = int(selection.removed.sum() - masks.removed.sum())
+    return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
