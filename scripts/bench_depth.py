@@ -25,6 +25,7 @@ from gimp3d.camera import Camera
 from gimp3d.compute.threads import parallel_map
 from gimp3d.errors import IllPosed
 from gimp3d.gaussians import Gaussians
+from gimp3d.geometry import disparity_of
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.ply import read_ply
 from gimp3d.job import write_atomically
@@ -34,7 +35,7 @@ from gimp3d.solvers.poisson import solve_poisson
 from gimp3d.stages.depth import DepthSettings, complete_depth, complete_disparity, fit_prior
 from gimp3d.stages.layers import distance_to
 from gimp3d.stages.masks import ViewMasks, find_masks
-from gimp3d.stages.reference import disparity_of, rim
+from gimp3d.stages.reference import rim
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = DepthSettings()

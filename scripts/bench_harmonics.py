@@ -177,7 +177,7 @@ def torch_methods(
 
 def terms(degree: int) -> Any:
     """Y_k, k ≥ 1, of tensors: sh_basis makes NumPy arrays."""
-    from gimp3d.solvers.harmonics import C1, C2, C3
+    from gimp3d.sh import C1, C2, C3
 
     def values(x: Any, y: Any, z: Any) -> Iterator[Any]:
         yield from (-C1 * y, C1 * z, -C1 * x)
@@ -263,10 +263,8 @@ def scenes(data: Path, out: Path) -> list[dict[str, Any]]:
     asked = {
         "degree 0": (0, HarmonicsSettings()),
         "degree 1, ridge 1": (1, HarmonicsSettings(ridge=1.0)),
-        "floor 0.2": (2, HarmonicsSettings()),
-        "floor 20": (2, HarmonicsSettings(floor=20.0)),
-        "floor 20, offset": (2, HarmonicsSettings(floor=20.0, offset=True)),
-        "floor 6, offset": (2, HarmonicsSettings(floor=6.0, offset=True)),
+        "floor 20": (2, HarmonicsSettings()),
+        "floor 20, offset": (2, HarmonicsSettings(offset=True)),
     }
     variants = {
         name: replace(balanced.seed, sh_degree=degree, harmonics=settings) for name, (degree, settings) in asked.items()

@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from bench_raster import HERE, ROOT, machine, say, write
@@ -32,6 +33,7 @@ from photographs import SHARE, blob, photographs
 from raster_report import table
 
 from gimp3d.compute.threads import set_thread_count
+from gimp3d.solvers import patchmatch
 from gimp3d.solvers.patches import lay_out
 from gimp3d.solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field, patch_centres
 
@@ -72,8 +74,10 @@ def main() -> int:
 def methods() -> dict[tuple[str, str], Callable[[np.ndarray, np.ndarray], np.ndarray]]:
     """(method, effort) → function from picture and hole to cost [H, W]."""
 
-    def ours(picture: np.ndarray, hole: np.ndarray, **settings: int) -> np.ndarray:
-        return nearest_neighbour_field(picture, hole, ~hole, None, PatchMatchSettings(coherence=0.0, **settings)).cost
+    def ours(picture: np.ndarray, hole: np.ndarray, grid: int, tree_sweeps: int, sweeps: int) -> np.ndarray:
+        settings = PatchMatchSettings(coherence=0.0, sweeps=sweeps)
+        with mock.patch.multiple(patchmatch, GRID=grid, TREE_SWEEPS=tree_sweeps):
+            return nearest_neighbour_field(picture, hole, ~hole, None, settings).cost
 
     found: dict[tuple[str, str], Callable[[np.ndarray, np.ndarray], np.ndarray]] = {}
     for grid, tree_sweeps, sweeps in ((4, 1, 1), (3, 1, 2), (2, 1, 2), (2, 2, 4), (1, 2, 4)):

@@ -28,6 +28,7 @@ from structured import edge_error, structured
 from gimp3d.box import read_region
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.metrics import psnr
+from gimp3d.geometry import disparity_of
 from gimp3d.io.formats import read_scene as read_splat
 from gimp3d.io.images import load_view, read_image
 from gimp3d.pipeline import PRESETS, View, remove_object
@@ -35,7 +36,6 @@ from gimp3d.solvers import exemplar
 from gimp3d.solvers.exemplar import ExemplarSettings, complete_picture
 from gimp3d.solvers.surface import tangent_planes
 from gimp3d.stages.charts import Chart
-from gimp3d.stages.reference import disparity_of
 
 
 class Task(NamedTuple):

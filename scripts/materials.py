@@ -18,6 +18,7 @@ MATERIALS = ("Lambertian", "smooth", "specular")
 BASE = 0.4  # colour without the material's own
 NOISE, ANCHOR_NOISE, WRONG = 0.02, 0.01, 0.3  # standard deviations, and by how much a wrong observation is off
 SCORED = 40  # directions that a fit is scored in, inside and outside the cone
+FLOOR = 0.2  # of our ridge, where colours have noise alone
 PAPER_SIGMA = 0.1  # σ_0 of the rules that fit_harmonics is compared with, as they were first measured
 LAPLACE = np.repeat([1.0, 9.0, 36.0], [3, 5, 7])  # (l (l + 1) / 2)² per coefficient
 
@@ -125,7 +126,7 @@ def leave_one_out(s: Simulation) -> np.ndarray:
 
 
 def gimp3d(s: Simulation, settings: HarmonicsSettings = HarmonicsSettings()) -> np.ndarray:
-    return fit_harmonics(grey(s.anchors), s.anchor_directions, observations(s), 3, settings).sh[:, 1:, 0]
+    return fit_harmonics(grey(s.anchors), s.anchor_directions, observations(s), 3, settings, FLOOR).sh[:, 1:, 0]
 
 
 def with_offset(s: Simulation) -> np.ndarray:

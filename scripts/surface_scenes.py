@@ -17,18 +17,18 @@ from gimp3d.camera import Camera, output_name
 from gimp3d.commands import select_cameras
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import Gaussians
+from gimp3d.geometry import SOLID, disparity_of
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import load_view, read_mask
 from gimp3d.io.ply import read_ply
 from gimp3d.stages import depth as depth_stage
 from gimp3d.stages.depth import DepthCompletion, DepthSettings, complete_disparity
 from gimp3d.stages.masks import Masks, MaskSettings, ViewMasks, find_masks
-from gimp3d.stages.reference import choose_reference, disparity_of, rim
+from gimp3d.stages.reference import choose_reference, rim
 
 SHADOW = "_shadow"  # what a scene's name ends in whose photos show the object's shadows and reflections
 SEES_PHOTOS = "photos" in inspect.signature(find_masks).parameters
 COMPLETE_DEPTH = getattr(depth_stage, "complete_depth", None)  # with what other views know of the hole, where it can
-SOLID = MaskSettings().solid
 
 
 @dataclass(frozen=True)

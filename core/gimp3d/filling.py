@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from . import pictures
-from .compute import buffers
 from .errors import IllPosed
 from .gaussians import Gaussians
 from .geometry import SAME_DEPTH, SOLID
@@ -69,7 +68,6 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
     for number, turn in enumerate(turns):
         if number and open_pixels(filling.views) < run.settings.extra_gain * hole:
             break
-        buffers.release()  # one stage's arrays are of little use to the next
         suffix = f" {number + 1}" if number else ""
         try:
             if turn.chart is None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from .compute.threads import parallel_map
 from .gaussians import Gaussians
+from .geometry import window_mask
 from .raster import footprint, touched_window
 from .result import Picture
 from .stages.charts import Chart
@@ -17,7 +18,6 @@ from .stages.depth import DepthCompletion
 from .stages.light import Relit
 from .stages.mapping import MappingField
 from .stages.masks import Masks
-from .stages.outline import window_mask
 from .stages.propagate import Propagation
 from .stages.view_refinement import ViewRefinement
 from .view_state import ViewState

@@ -10,11 +10,12 @@ from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
+from .stages.evidence import EvidenceSettings
 from .stages.layers import LayerSettings
 from .stages.mapping import MappingSettings
 from .stages.masks import MaskSettings
 from .stages.propagate import PropagateSettings
-from .stages.reference import EvidenceSettings, ReferenceSettings
+from .stages.reference import ReferenceSettings
 from .stages.refine import RefineSettings
 from .stages.seed import SeedSettings
 from .stages.selection import SelectionSettings

@@ -1,1 +1,1 @@
-"""How the work is done on a CPU: compiled kernels, SIMD vectors, threads and their buffers."""
+"""How the work is done on a CPU: compiled kernels, SIMD vectors, threads."""

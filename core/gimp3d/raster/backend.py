@@ -102,7 +102,16 @@ class Backend(Protocol):
 class CpuBackend:
     """This machine's cores."""
 
-    render = staticmethod(cpu.render)
+    @staticmethod
+    def render(
+        gaussians: Gaussians,
+        camera: Camera,
+        settings: RasterSettings,
+        passes: frozenset[str],
+        pixels: np.ndarray | None,
+    ) -> Rendering:
+        return CpuDrawing(gaussians, camera, settings, "rgb" in passes, pixels).render(passes)
+
     trace = staticmethod(cpu.trace)
     pixel_region = staticmethod(CpuPixelRegion)
     drawing = staticmethod(CpuDrawing)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import float32, float64, int64, uint64
 
-from ..compute.buffers import empty, zeros
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import (
     floor16,
@@ -82,8 +81,8 @@ def tile_lists(
     bounds = _chunks(len(order))
     chunks = range(len(bounds) - 1)
     places = np.zeros((len(chunks), len(tiles)), np.int64)
-    ordered, masks = empty(len(order), np.int64), empty(len(order), np.uint64)
-    spans = zeros((len(states) if with_records else 0, 2), np.int64)
+    ordered, masks = np.empty(len(order), np.int64), np.empty(len(order), np.uint64)
+    spans = np.zeros((len(states) if with_records else 0, 2), np.int64)
     packed = rects.view(np.int64).ravel()
 
     def deal(k: int, entries: np.ndarray, record: int, records: np.ndarray) -> int:
@@ -96,7 +95,7 @@ def tile_lists(
     places = np.ascontiguousarray(ends.T) - places
     starts = np.zeros(len(tiles) + 1, np.int64)
     starts[1:] = ends[:, -1]
-    entries, records = empty(starts[-1], np.int32), empty(starts[-1] if with_records else 0, np.int64)
+    entries, records = np.empty(starts[-1], np.int32), np.empty(starts[-1] if with_records else 0, np.int64)
     if starts[-1]:
         first = np.cumsum([0, *counts])
         parallel_map(lambda k: deal(k, entries, first[k], records), chunks)
@@ -122,7 +121,7 @@ def depth_order(
     drawn = [_count_drawn(states, bounds[k], bounds[k + 1]) for k in chunks]
     starts = np.concatenate([[0], np.cumsum(drawn)])
     total = int(starts[-1])
-    rows, keys = empty((2, total), np.int32), empty((2, total), np.int32)
+    rows, keys = np.empty((2, total), np.int32), np.empty((2, total), np.int32)
     parallel_map(
         lambda k: _gather_keys(bounds[k], bounds[k + 1], features.view(np.int32), states, starts[k], rows[0], keys[0]),
         chunks,

@@ -33,32 +33,7 @@ from ..compute.simd import (
     where_greater,
 )
 from .bin import ONE, cover_mask
-from .project import (
-    A_X,
-    A_Y,
-    BLUE,
-    BOUND_X,
-    BOUND_Y,
-    CENTRE_X,
-    CENTRE_Y,
-    DEPTH,
-    GREEN,
-    HALF,
-    LOG2_OPACITY,
-    NORMAL_X,
-    NORMAL_Y,
-    NORMAL_Z,
-    RED,
-    TILE,
-    U_X,
-    U_Y,
-    V_X,
-    V_Y,
-    WHITEN_XX,
-    WHITEN_XY,
-    WHITEN_YY,
-    ZERO,
-)
+from .project import DEPTH, HALF, TILE, ZERO, ellipse_of, shown_of, surfel_of
 
 BLOCK = 4  # px, side of a block
 BLOCKS = 64  # in a tile
@@ -236,14 +211,10 @@ def blend_range(
             if len(masks):
                 masks[i] = mask
             number = splat16(float32(i - first + 1))
-            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
-            red, green, blue = load1(flat, o + RED), load1(flat, o + GREEN), load1(flat, o + BLUE)
-            nx, ny, nz = load1(flat, o + NORMAL_X), load1(flat, o + NORMAL_Y), load1(flat, o + NORMAL_Z)
+            log2_opacity, depth, red, green, blue, nx, ny, nz = shown_of(flat, o)
             if surfels:
-                x, y = float32(left) + HALF - load1(flat, o + CENTRE_X), float32(top) + HALF - load1(flat, o + CENTRE_Y)
-                u_x, u_y = load1(flat, o + U_X), load1(flat, o + U_Y)
-                v_x, v_y = load1(flat, o + V_X), load1(flat, o + V_Y)
-                a_x, a_y = load1(flat, o + A_X), load1(flat, o + A_Y)
+                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 disparity = distortion_near / depth
                 while mask:
                     b = lowest_bit(mask)
@@ -272,8 +243,8 @@ def blend_range(
                         m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                         _add_disparity(state, k, weight, m)
             else:
-                x, y = float32(left) + HALF - load1(flat, o + BOUND_X), float32(top) + HALF - load1(flat, o + BOUND_Y)
-                xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+                x, y, xx, xy, yy = ellipse_of(flat, o)
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 along0, down0 = fma16(column, xx, row * xy), row * yy
                 m = splat16(distortion_near / depth - disparity_shift)
                 while mask:
@@ -305,8 +276,8 @@ def blend_range(
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
         if len(pictures[1]):
-            _finish(state, left, top, width, wanted[slot], shift, first, entries, features, surfels, limits, flags,
-                    background, back, slot, pictures)  # fmt: skip
+            _finish(state, left, top, width, wanted[slot], shift, first, entries, flat, row_size, surfels, limits,
+                    flags, background, back, slot, pictures)  # fmt: skip
 
 
 @inline_kernel
@@ -338,9 +309,18 @@ def total(state, back, slot, k, plane, clear):
 
 
 @inline_kernel
+def total_normal(state, back, slot, k, clear):
+    """The sum of the normals along the ray, and 1 / its length, or 0 where there is nothing."""
+    nx, ny = total(state, back, slot, k, NX, clear), total(state, back, slot, k, NY, clear)
+    nz = total(state, back, slot, k, NZ, clear)
+    length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
+    return nx, ny, nz, where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
+
+
+@inline_kernel
 def _finish(
-    state, left, top, width, wanted, shift, first, entries, features, surfels, limits, flags, background, back, slot,
-    pictures,
+    state, left, top, width, wanted, shift, first, entries, flat, row_size, surfels, limits, flags, background, back,
+    slot, pictures,
 ):  # fmt: skip
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
     rgb, alpha, expected, median, normals, distortion = pictures
@@ -374,17 +354,11 @@ def _finish(
                 if number > 0 and flags[5]:
                     numbers[lane] = entries[first + number - 1] + 1
                 elif number > 0:
-                    row = features[entries[first + number - 1]]
-                    depths[lane] = depth_at(row, u + lane % BLOCK, v + lane // BLOCK, surfels, limits)
+                    at = int64(entries[first + number - 1]) * row_size
+                    depths[lane] = depth_at(flat, at, u + lane % BLOCK, v + lane // BLOCK, surfels, limits)
             store_block(median, o, width, load16(depths, 0))
         if flags[3]:
-            nx, ny, nz = (
-                total(state, back, slot, k, NX, clear),
-                total(state, back, slot, k, NY, clear),
-                total(state, back, slot, k, NZ, clear),
-            )
-            length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
-            inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
+            nx, ny, nz, inverse = total_normal(state, back, slot, k, clear)
             store_block3(normals, 3 * o, 3 * width, nx * inverse, ny * inverse, nz * inverse)
         if flags[4]:
             m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
@@ -392,13 +366,14 @@ def _finish(
 
 
 @inline_kernel
-def depth_at(f, u, v, surfels, limits):
-    """z at pixel (u, v) of the Gaussian with feature row f."""
-    depth = f[DEPTH]
+def depth_at(flat, o, u, v, surfels, limits):
+    """z at pixel (u, v) of the Gaussian whose feature row begins at o."""
+    depth = load1(flat, o + DEPTH)
     if surfels:
-        dx, dy = float32(u) + HALF - f[CENTRE_X], float32(v) + HALF - f[CENTRE_Y]
-        along_u, along_v = f[U_X] * dx + f[U_Y] * dy, f[V_X] * dx + f[V_Y] * dy
-        den = ONE + f[A_X] * dx + f[A_Y] * dy
+        x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+        dx, dy = float32(u) + HALF - x, float32(v) + HALF - y
+        along_u, along_v = u_x * dx + u_y * dy, v_x * dx + v_y * dy
+        den = ONE + a_x * dx + a_y * dy
         squared = (along_u * along_u + along_v * along_v) / (den * den)
         if den > HORIZON and depth >= limits[3] * den and squared <= (dx * dx + dy * dy) * limits[4]:
             depth = depth / den
@@ -452,7 +427,7 @@ def weigh_range(
             if (i - first) % CHECK == 0:
                 _cover(entries, i, min(i + CHECK, end), end, flat, row_size, left, top, covers)
             mask = alive & covers[(i - first) % CHECK]
-            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
+            log2_opacity, depth, _, _, _, _, _, _ = shown_of(flat, o)
             peak = none
             for label in range(kinds):
                 store16(weight_sums, 16 * label, none)
@@ -465,17 +440,18 @@ def weigh_range(
                     float32(top) + HALF + BLOCK_PX * float32(b >> 3),
                 )
                 if surfels:
-                    dx, dy = column + (x - load1(flat, o + CENTRE_X)), row + (y - load1(flat, o + CENTRE_Y))
-                    u = fma16(dx, load1(flat, o + U_X), dy * load1(flat, o + U_Y))
-                    v = fma16(dx, load1(flat, o + V_X), dy * load1(flat, o + V_Y))
-                    den = fma16(dx, load1(flat, o + A_X), fma16(dy, load1(flat, o + A_Y), one))
+                    centre_x, centre_y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+                    dx, dy = column + (x - centre_x), row + (y - centre_y)
+                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
+                    den = fma16(dx, a_x, fma16(dy, a_y, one))
                     _, alpha, _, _ = surfel_alpha(
                         u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
                     )
                 else:
-                    dx, dy = column + (x - load1(flat, o + BOUND_X)), row + (y - load1(flat, o + BOUND_Y))
-                    along = fma16(dx, load1(flat, o + WHITEN_XX), dy * load1(flat, o + WHITEN_XY))
-                    _, alpha = ellipse_alpha(along, dy * load1(flat, o + WHITEN_YY), log2_opacity, alpha_min, alpha_max)
+                    centre_x, centre_y, xx, xy, yy = ellipse_of(flat, o)
+                    dx, dy = column + (x - centre_x), row + (y - centre_y)
+                    along = fma16(dx, xx, dy * xy)
+                    _, alpha = ellipse_alpha(along, dy * yy, log2_opacity, alpha_min, alpha_max)
                 before = load16(state, k + T)
                 weight = alpha * before
                 store16(state, k + T, before - weight)

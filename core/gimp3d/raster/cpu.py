@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ..camera import Camera
-from ..compute.buffers import empty, zeros
 from ..compute.jit import announce_compilation
 from ..compute.threads import parallel_map, run_ranges, thread_count
 from ..gaussians import Gaussians
@@ -61,16 +60,13 @@ def project(
     announce_compilation()
     n = len(gaussians)
     if out is None:
-        features = empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
-        out = View(features, empty((n, 4), np.int16), empty(n, np.int8))
-    sh = raw(gaussians.sh)
+        features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
+        out = View(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+    *geometry, sh = values_of(gaussians)
     run_ranges(
         project_range,
         n,
-        raw(gaussians.means),
-        raw(gaussians.log_scales),
-        raw(gaussians.quats),
-        raw(gaussians.opacity_logits),
+        *geometry,
         sh,
         sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
         pack_camera(camera),
@@ -97,6 +93,12 @@ def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
 def raw(values: np.ndarray) -> np.ndarray:
     """The values as kernels always get them: another layout, or read-only memory, would compile them anew."""
     return np.require(values, np.float32, ["C", "A", "W"])
+
+
+def values_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
+    """What is stored of Gaussians, in the order in which all kernels take it and give gradients."""
+    g = gaussians
+    return tuple(raw(values) for values in (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh))
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -148,7 +150,7 @@ def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
     """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
     wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
     height, width = padded_size(camera)
-    return tuple(zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
+    return tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
 
 
 def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
@@ -239,36 +241,15 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
-def render(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    passes: frozenset[str],
-    pixels: np.ndarray | None,
-) -> Rendering:
-    return _draw(gaussians, camera, settings, passes, False, pixels)[0]
-
-
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    return _draw(gaussians, camera, settings, passes, True, None)
-
-
-def _draw(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    passes: frozenset[str],
-    keep: bool,
-    pixels: np.ndarray | None,
-) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
-    slots, wanted = wanted_tiles(camera, pixels)
+    slots, wanted = whole_picture(camera)
     view = project(gaussians, camera, settings, bool(flags[0]), slots=slots)
-    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=keep)
+    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=True)
     shifts = depth_shifts(lists, view.features)
-    pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep)
+    pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep=True)
     return as_rendering(pictures, camera, view.ignored), kept
 
 
@@ -298,10 +279,10 @@ def blend(
         lists,
         wanted,
         shifts,
-        empty(entry_count, np.uint64) if keep else NO_MASKS,
+        np.empty(entry_count, np.uint64) if keep else NO_MASKS,
         np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
         np.empty(slot_count, np.int64),
-        empty((slot_count, TILE_STATE), np.float32) if keep else NO_STATES,
+        np.empty((slot_count, TILE_STATE), np.float32) if keep else NO_STATES,
         back,
     )
     pictures = empty_pictures(camera, flags)
@@ -339,7 +320,7 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
     ]
     if missing:
         raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
-    records = empty((len(lists.records), RECORD), np.float32)
+    records = np.empty((len(lists.records), RECORD), np.float32)
     over_tiles(
         unblend_range,
         lists,
@@ -361,41 +342,27 @@ def _backward(traced: Trace, given: PictureGradients) -> Gradients:
         lists.records,
         records.reshape(-1),
     )
-    return _unproject(traced, records)
+    return _unproject(traced, records.reshape(-1))
 
 
 def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
     """Gradients of the traced Gaussians."""
-    gaussians, settings, lists = traced.gaussians, traced.settings, traced.lists
-    out = Gradients(
-        empty(gaussians.means.shape, np.float32),
-        empty(gaussians.log_scales.shape, np.float32),
-        empty(gaussians.quats.shape, np.float32),
-        empty(gaussians.opacity_logits.shape, np.float32),
-        empty(gaussians.sh.shape, np.float32),
-    )
+    values = values_of(traced.gaussians)
+    found = tuple(np.empty(v.shape, np.float32) for v in values)
     run_ranges(
         unproject_range,
-        len(gaussians),
-        raw(gaussians.means),
-        raw(gaussians.log_scales),
-        raw(gaussians.quats),
-        raw(gaussians.opacity_logits),
-        raw(gaussians.sh),
+        len(traced.gaussians),
+        *values,
         pack_camera(traced.camera),
-        float(settings.low_pass),
-        bool(gaussians.antialiased),
+        float(traced.settings.low_pass),
+        bool(traced.gaussians.antialiased),
         traced.view.features,
         traced.view.states,
-        lists.spans,
-        records.reshape(-1),
-        out.means,
-        out.log_scales,
-        out.quats,
-        out.opacity_logits,
-        out.sh,
+        traced.lists.spans,
+        records,
+        *found,
     )
-    return out
+    return Gradients(*found)
 
 
 def check_gradients(given: PictureGradients, camera: Camera) -> None:

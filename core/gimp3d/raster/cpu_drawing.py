@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from ..camera import Camera
-from ..compute.buffers import zeros
 from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
 from ..gaussians import Gaussians
@@ -52,14 +51,12 @@ class CpuDrawing:
             drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self.settings, lists, self._wanted)
             return drawn.median_depth, drawn.alpha
         drawn = self._draw(NUMBERS_ONLY, self.settings, lists, self._wanted)
-        depth = zeros(drawn.alpha.shape, np.float32)
+        depth = np.zeros(drawn.alpha.shape, np.float32)
         run_ranges(
             meet_range,
             len(depth),
             drawn.median_depth.view(np.int32),
-            cpu.raw(self.gaussians.means),
-            cpu.raw(self.gaussians.log_scales),
-            cpu.raw(self.gaussians.quats),
+            *cpu.values_of(self.gaussians)[:3],
             cpu.pack_camera(self.camera),
             float(self.settings.low_pass),
             depth,

@@ -13,8 +13,11 @@ import math
 import numpy as np
 from numba import float32, float64, int32, int64
 
+from .. import sh as harmonics
+from ..compute.exp_log import LOG2E, exp64, log2_64
 from ..compute.jit import exact_kernel, inline_kernel
-from ..compute.simd import bits_of, float_of, load1, store1
+from ..compute.simd import load1, store1
+from ..gaussians import SH_C0
 
 TILE = 32  # px, side of a tile
 
@@ -42,30 +45,15 @@ EDGE_ON = 1e-6  # sine of the angle to its plane below which a surfel is seen by
 SHARP = 1e6  # 1/px: so steep that only the low-pass is left
 LARGEST_LOG_SCALE = 80.0  # as Gaussians.usable
 SMALLEST_SQUARED_QUAT = 1e-20
-LOG2E, LN2 = math.log2(math.e), math.log(2.0)
 HALF_LOG2E = 0.5 * LOG2E  # exp(−x²/2) = 2^(−HALF_LOG2E · x²)
 EXPONENT_BITS = np.int32(0x7F800000)  # a float32 is finite if its magnitude bits lie below
 MAGNITUDE_BITS = np.int32(0x7FFFFFFF)
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
-# float64 numbers as bits, for exp and log2 that vectorise (libm's calls do not)
-ROUNDING = 1.5 * 2.0**52  # added to a float64 it leaves the nearest integer in the low mantissa bits
-MANTISSA_BITS = np.int64(0xFFFFFFFFFFFFF)
-INTEGER_BITS, INTEGER_OFFSET = np.int64(0x4330000000000000), 2.0**52  # float_of(INTEGER_BITS | k) = 2^52 + k
-
-# Real spherical harmonics in 3DGS's order and signs.
-C0, C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
-C2 = tuple(np.float32(c) for c in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396))
-C3 = tuple(
-    np.float32(c)
-    for c in (
-        0.5900435899266435,
-        2.890611442640554,
-        0.4570457994644658,
-        0.3731763325901154,
-        1.445305721320277,
-    )
-)
+# Real spherical harmonics: the magnitudes of sh.py's factors.
+C0, C1 = np.float32(SH_C0), np.float32(harmonics.C1)
+C2 = tuple(np.float32(abs(harmonics.C2[k])) for k in (0, 2, 4))
+C3 = tuple(np.float32(abs(harmonics.C3[k])) for k in (0, 1, 2, 3, 5))
 TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
 
 # Scratch planes of a chunk: what is staged, then what comes out of it
@@ -80,43 +68,31 @@ BASIS_PLANES = 19
 
 
 @inline_kernel
-def exp64(x):
-    """e^x with a relative error of 1e-11 for |x| ≤ 700; it is clamped beyond. For exact kernels only: fast-math
-    would cancel ROUNDING."""
-    x = min(max(x, -700.0), 700.0)
-    shifted = x * LOG2E + ROUNDING
-    r = x - (shifted - ROUNDING) * LN2
-    p = 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
-    return float_of(bits_of(p) + (bits_of(shifted) << int64(52)))
+def shown_of(flat, o):
+    """Of the feature row that begins at o: log₂ of the opacity, depth, colour and normal."""
+    return (
+        load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH),
+        load1(flat, o + RED), load1(flat, o + GREEN), load1(flat, o + BLUE),
+        load1(flat, o + NORMAL_X), load1(flat, o + NORMAL_Y), load1(flat, o + NORMAL_Z),
+    )  # fmt: skip
 
 
 @inline_kernel
-def log2_64(y):
-    """log₂ y of a normal number with an absolute error of 1e-11."""
-    bits = bits_of(y)
-    # the exponent is counted from √½, so that the mantissa lies in [√½, √2)
-    lifted = bits - np.int64(0x3FE6A09E667F3BCD)
-    exponent = float_of(INTEGER_BITS | ((lifted >> int64(52)) + int64(2048))) - (INTEGER_OFFSET + 2048.0)
-    m = float_of((lifted & MANTISSA_BITS) + np.int64(0x3FE6A09E667F3BCD))
-    s = (m - 1.0) / (m + 1.0)
-    ss = s * s
-    p = 1.0 / 13.0
-    p = p * ss + 1.0 / 11.0
-    p = p * ss + 1.0 / 9.0
-    p = p * ss + 1.0 / 7.0
-    p = p * ss + 1.0 / 5.0
-    p = p * ss + 1.0 / 3.0
-    p = p * ss + 1.0
-    return exponent + 2.0 * LOG2E * s * p
+def ellipse_of(flat, o):
+    """Of a 3D Gaussian's feature row: its centre and whitening matrix."""
+    return (
+        load1(flat, o + BOUND_X), load1(flat, o + BOUND_Y),
+        load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY),
+    )  # fmt: skip
+
+
+@inline_kernel
+def surfel_of(flat, o):
+    """Of a surfel's feature row: its centre, U, V and A."""
+    return (
+        load1(flat, o + CENTRE_X), load1(flat, o + CENTRE_Y), load1(flat, o + U_X), load1(flat, o + U_Y),
+        load1(flat, o + V_X), load1(flat, o + V_Y), load1(flat, o + A_X), load1(flat, o + A_Y),
+    )  # fmt: skip
 
 
 @inline_kernel
@@ -193,6 +169,16 @@ def rotation(w, x, y, z):
 
 
 @inline_kernel
+def to_camera(r, x, y, z):
+    """A direction in the world's axes in the camera's."""
+    return (
+        r[0] * x + r[1] * y + r[2] * z,
+        r[3] * x + r[4] * y + r[5] * z,
+        r[6] * x + r[7] * y + r[8] * z,
+    )
+
+
+@inline_kernel
 def load_quat(s, k):
     return load1(s, QW + k), load1(s, QX + k), load1(s, QY + k), load1(s, QZ + k)
 
@@ -200,9 +186,8 @@ def load_quat(s, k):
 @exact_kernel
 def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
     """The first n staged 3D Gaussians as ellipses in the image."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
-    )  # fmt: skip
+    r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = r
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     left, right, top, bottom = camera[19], camera[20], camera[21], camera[22]
     for k in range(n):
@@ -249,11 +234,7 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         wx = q02 if third else (q00 if first else q01)
         wy = q12 if third else (q10 if first else q11)
         wz = q22 if third else (q20 if first else q21)
-        nx, ny, nz = (
-            r00 * wx + r01 * wy + r02 * wz,
-            r10 * wx + r11 * wy + r12 * wz,
-            r20 * wx + r21 * wy + r22 * wz,
-        )
+        nx, ny, nz = to_camera(r, wx, wy, wz)
         facing = -1.0 if nx * x + ny * y + nz * load1(s, Z + k) > 0.0 else 1.0
         store1(s, OUT_NX + k, facing * nx)
         store1(s, OUT_NY + k, facing * ny)
@@ -263,29 +244,15 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
 @exact_kernel
 def _surfels(s, n, camera, low_pass, log2_alpha_min):
     """The first n staged surfels: their own coordinates as functions of the pixel, and an ellipse around them."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
-    )  # fmt: skip
+    r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     for k in range(n):
         x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
         qw, qx, qy, qz = load_quat(s, k)
         q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
-        tx, ty, tz = (
-            r00 * q00 + r01 * q10 + r02 * q20,
-            r10 * q00 + r11 * q10 + r12 * q20,
-            r20 * q00 + r21 * q10 + r22 * q20,
-        )
-        bx, by, bz = (
-            r00 * q01 + r01 * q11 + r02 * q21,
-            r10 * q01 + r11 * q11 + r12 * q21,
-            r20 * q01 + r21 * q11 + r22 * q21,
-        )
-        nx, ny, nz = (
-            r00 * q02 + r01 * q12 + r02 * q22,
-            r10 * q02 + r11 * q12 + r12 * q22,
-            r20 * q02 + r21 * q12 + r22 * q22,
-        )
+        tx, ty, tz = to_camera(r, q00, q10, q20)
+        bx, by, bz = to_camera(r, q01, q11, q21)
+        nx, ny, nz = to_camera(r, q02, q12, q22)
         # The ray (x̂, ŷ, 1) z through a pixel meets the plane n·p = n·c at z = n·c / n·(x̂, ŷ, 1).
         plane = nx * x + ny * y + nz * z
         seen = plane * plane > EDGE_ON * EDGE_ON * (x * x + y * y + z * z)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..camera import Camera
-from ..compute.buffers import empty
 from ..compute.jit import exact_kernel
 from ..gaussians import Gaussians
 from . import cpu
@@ -48,7 +47,7 @@ class CpuPixelRegion:
         lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
         rows, entries = np.unique(lists.entries, return_inverse=True)
         self._frozen_count, self._surfels = len(rows), frozen.is_surfels
-        self._features = empty((len(rows), view.features.shape[1]), np.float32)
+        self._features = np.empty((len(rows), view.features.shape[1]), np.float32)
         self._features[:] = view.features[rows]
         self._lists = replace(lists, entries=entries.astype(np.int32).ravel())
         self._depths = np.ascontiguousarray(self._features[self._lists.entries, DEPTH])
@@ -58,7 +57,10 @@ class CpuPixelRegion:
         self._near, self._far = np.empty((2, slots), np.float32)  # the slabs of depths that the layers leave out
         self._slab_starts, self._slab_stops = lists.starts.copy(), lists.stops.copy()
         layered = slots if not self._flags[2] else 0
-        self._front, self._back = empty((layered, TILE_STATE), np.float32), empty((layered, TILE_STATE), np.float32)
+        self._front, self._back = (
+            np.empty((layered, TILE_STATE), np.float32),
+            np.empty((layered, TILE_STATE), np.float32),
+        )
         self._renderings = 0
 
     def render(self, active: Gaussians) -> Rendering:
@@ -101,7 +103,7 @@ class CpuPixelRegion:
         needed = self._frozen_count + len(active)
         if len(self._features) != needed:
             before = self._features
-            self._features = empty((needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW), np.float32)
+            self._features = np.empty((needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW), np.float32)
             self._features[: self._frozen_count] = before[: self._frozen_count]
         n = len(active)
         out = cpu.View(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
@@ -131,7 +133,7 @@ class CpuPixelRegion:
 
     def _layer(self, slots: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
         """The state of the slots' tiles after a part of their frozen entries, [·, TILE_STATE]."""
-        states = empty((len(slots), TILE_STATE), np.float32)
+        states = np.empty((len(slots), TILE_STATE), np.float32)
         cpu.over_tiles(
             blend_range,
             replace(self._lists, tiles=self._lists.tiles[slots], starts=starts, stops=stops),

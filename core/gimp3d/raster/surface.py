@@ -13,8 +13,9 @@ import math
 import numpy as np
 from numba import float64, int64
 
+from ..compute.exp_log import exp64
 from ..compute.jit import exact_kernel
-from .project import exp64, rotation
+from .project import rotation
 
 REACH = 3.0  # standard deviations from its centre, along z, within which a Gaussian is met
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..geometry import Window as Window
+
 PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal", "distortion"})
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})  # what a picture usually needs
-
-Window = tuple[slice, slice]  # rows and columns of a picture
 
 
 @dataclass(frozen=True)

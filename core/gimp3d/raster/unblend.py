@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numba import float32, int64, uint64
 
+from ..compute.exp_log import LN2
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import (
     columns16,
     fma16,
-    load1,
     load16,
     load_block,
     load_block_x,
@@ -26,7 +26,6 @@ from ..compute.simd import (
     prefetch,
     rows16,
     splat16,
-    sqrt16,
     store16,
     sums16,
     where_equal,
@@ -46,8 +45,6 @@ from .blend import (
     MEDIAN,
     NOTHING,
     NX,
-    NY,
-    NZ,
     R,
     T,
     Z,
@@ -55,34 +52,9 @@ from .blend import (
     ellipse_alpha,
     surfel_alpha,
     total,
+    total_normal,
 )
-from .project import (
-    A_X,
-    A_Y,
-    BLUE,
-    BOUND_X,
-    BOUND_Y,
-    CENTRE_X,
-    CENTRE_Y,
-    DEPTH,
-    GREEN,
-    HALF,
-    LN2,
-    LOG2_OPACITY,
-    NORMAL_X,
-    NORMAL_Y,
-    NORMAL_Z,
-    RED,
-    TILE,
-    U_X,
-    U_Y,
-    V_X,
-    V_Y,
-    WHITEN_XX,
-    WHITEN_XY,
-    WHITEN_YY,
-    ZERO,
-)
+from .project import HALF, TILE, ZERO, ellipse_of, shown_of, surfel_of
 
 RECORD = 16
 # A 3D Gaussian's record: sums over pixels. p is the gradient with respect to ln alpha, (dx, dy) the offset from its
@@ -152,17 +124,13 @@ def unblend_range(
             o = int64(entries[i]) * row_size
             prefetch(flat, int64(entries[max(i - CHECK, first)]) * row_size)
             number = splat16(float32(done))
-            log2_opacity, depth = load1(flat, o + LOG2_OPACITY), load1(flat, o + DEPTH)
-            red, green, blue = load1(flat, o + RED), load1(flat, o + GREEN), load1(flat, o + BLUE)
-            nx, ny, nz = load1(flat, o + NORMAL_X), load1(flat, o + NORMAL_Y), load1(flat, o + NORMAL_Z)
+            log2_opacity, depth, red, green, blue, nx, ny, nz = shown_of(flat, o)
             active = entries[i] >= first_active
             s_red, s_green, s_blue, s_depth, s_log = none, none, none, none, none
             s_nx, s_ny, s_nz = none, none, none
             if surfels:
-                x, y = float32(left) + HALF - load1(flat, o + CENTRE_X), float32(top) + HALF - load1(flat, o + CENTRE_Y)
-                u_x, u_y = load1(flat, o + U_X), load1(flat, o + U_Y)
-                v_x, v_y = load1(flat, o + V_X), load1(flat, o + V_Y)
-                a_x, a_y = load1(flat, o + A_X), load1(flat, o + A_Y)
+                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 disparity = distortion_near / depth
                 s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy = none, none, none, none, none, none, none, none
                 while mask:
@@ -224,8 +192,8 @@ def unblend_range(
                     )  # fmt: skip
                     store16(records, record_rows[i] * RECORD, sums)
             else:
-                x, y = float32(left) + HALF - load1(flat, o + BOUND_X), float32(top) + HALF - load1(flat, o + BOUND_Y)
-                xx, xy, yy = load1(flat, o + WHITEN_XX), load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+                x, y, xx, xy, yy = ellipse_of(flat, o)
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 along0, down0 = fma16(column, xx, row * xy), row * yy
                 disparity = distortion_near / depth
                 z, m = splat16(depth - shift), splat16(disparity - disparity_shift)
@@ -356,13 +324,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
             g_w = g_w - g_z * total(state, back, slot, k, Z, clear) * enough
             store16(work, w + G_Z, g_z)
         if flags[3]:
-            nx, ny, nz = (
-                total(state, back, slot, k, NX, clear),
-                total(state, back, slot, k, NY, clear),
-                total(state, back, slot, k, NZ, clear),
-            )
-            length = sqrt16(fma16(nx, nx, fma16(ny, ny, nz * nz)))
-            inverse = where_greater(length, NOTHING, ONE / max16(length, NOTHING), ZERO)
+            nx, ny, nz, inverse = total_normal(state, back, slot, k, clear)
             nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
             g_x = load_block_x(d_normals, 3 * o, 3 * width)
             g_y = load_block_y(d_normals, 3 * o, 3 * width)

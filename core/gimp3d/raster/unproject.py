@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import float32, float64
 
+from ..compute.exp_log import exp64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import load1, load16, prefetch, splat16, store1, store16
 from .project import (
@@ -38,11 +39,11 @@ from .project import (
     X,
     Y,
     Z,
-    exp64,
     load_quat,
     rotation,
     sh_basis,
     stage,
+    to_camera,
 )
 from .unblend import (
     D_A_X,
@@ -247,7 +248,7 @@ def _ellipses_back(s, n, camera, low_pass, antialiased):
         wx = q02 if third else (q00 if first else q01)
         wy = q12 if third else (q10 if first else q11)
         wz = q22 if third else (q20 if first else q21)
-        nx, ny, nz = _to_camera(r, wx, wy, wz)
+        nx, ny, nz = to_camera(r, wx, wy, wz)
         facing = -1.0 if nx * x + ny * y + nz * z > 0.0 else 1.0
         to_third = facing if third else 0.0
         to_first = (0.0 if third else facing) if first else 0.0
@@ -280,9 +281,9 @@ def _surfels_back(s, n, camera):
         x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
         qw, qx, qy, qz = load_quat(s, k)
         q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
-        tx, ty, tz = _to_camera(r, q00, q10, q20)
-        bx, by, bz = _to_camera(r, q01, q11, q21)
-        nx, ny, nz = _to_camera(r, q02, q12, q22)
+        tx, ty, tz = to_camera(r, q00, q10, q20)
+        bx, by, bz = to_camera(r, q01, q11, q21)
+        nx, ny, nz = to_camera(r, q02, q12, q22)
         plane = nx * x + ny * y + nz * z
         seen = plane * plane > EDGE_ON * EDGE_ON * (x * x + y * y + z * z)
         inverse = 1.0 / plane if seen else 0.0
@@ -343,16 +344,6 @@ def _logits_back(s, n):
     """d ln o / d logit = 1 − o; a loop of its own, because within the others it stops them from vectorising."""
     for k in range(n):
         store1(s, D_LOGIT + k, _sum(s, LOG_ALPHA, k) / (1.0 + exp64(load1(s, LOGIT + k))))
-
-
-@inline_kernel
-def _to_camera(r, x, y, z):
-    """A direction in the world's axes in the camera's."""
-    return (
-        r[0] * x + r[1] * y + r[2] * z,
-        r[3] * x + r[4] * y + r[5] * z,
-        r[6] * x + r[7] * y + r[8] * z,
-    )
 
 
 @exact_kernel

@@ -16,7 +16,15 @@ from ..compute.threads import run_ranges
 from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
-from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
+from .patchmatch import (
+    REACH,
+    NearestNeighbourField,
+    PatchMatchSettings,
+    nearest_allowed,
+    patch_centres,
+    refined,
+    upsampled,
+)
 from .poisson import solve_hole
 from .regularity import continue_regularly, find_motions
 from .surface import Surface, coarser, supports, warps, whole_patches
@@ -43,7 +51,6 @@ class ExemplarSettings:
     sweeps: int = 2  # of PatchMatch per round
     rim_trust: float = 1.5  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
     settled: float = 0.3  # grey levels; a round that changes less ends its level
-    reach: int = 4  # of the random search round the best source
     locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
     seed: int = 0
 
@@ -165,7 +172,7 @@ def _filled(
     hole, allowed, radius = level.hole, level.allowed, level.radius
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
     guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
-    matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps, tree_sweeps=1, reach=settings.reach)
+    matching, reach = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps), REACH
     if coarser is None:
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.surface, level.usable)
         colours = level.channels[rows[hole], cols[hole]]
@@ -173,7 +180,7 @@ def _filled(
         if level.surface is None:
             index = index_patches(patches, allowed, TREE_GRID)
         else:
-            matching = replace(matching, reach=max(hole.shape))
+            reach = max(hole.shape)
     else:
         field = upsampled(coarser, level.touching)
         kept = field.found
@@ -187,8 +194,9 @@ def _filled(
         guides[hole] = colours[:, 3:]
         matching = replace(matching, seed=settings.seed + 31 * number)
         field = refined(
-            field, patches, level.touching, allowed, matching, penalty, index, guides, level.surface, level.usable
-        )
+            field, patches, level.touching, allowed, matching, penalty, index, guides, level.surface, level.usable,
+            reach, tree_sweeps=1,
+        )  # fmt: skip
         voted = _voted(level, field, _say(level, field), colours)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted

@@ -1,63 +1,46 @@
-"""Real spherical harmonics as 3DGS uses them, and fitting them to colours seen from several directions.
+"""Fitting real spherical harmonics, as 3DGS uses them, to colours seen from several directions.
 
-The fit (paper supplementary, METHOD section 6) is weighted least squares on the residuals c_ω − c_0 in the basis
-Y_k(ω) − Y_k(ω_0), so that the reference's colour c_0 comes out exactly in its own direction ω_0. Kernels take 16
-Gaussians at a time, one per lane: results depend neither on the number of threads nor on a lane's neighbours.
+The fit (paper supplementary; docs/method.md) is weighted least squares on the residuals c_ω − c_0 in the basis
+Y_k(ω) − Y_k(ω_0), so that the reference's colour c_0 comes out exactly in its own direction ω_0. Gaussians that are
+seen equally often are solved together: a Gaussian's result depends neither on its neighbours nor on the threads.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
-from numba import float32, int64
 
-from ..compute.jit import exact_kernel
-from ..compute.simd import exp2_16, fma16, load1, load16, max16, min16, splat16, sqrt16, store1, store16, where_greater
-from ..compute.threads import run_ranges
+from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0
-from ..sh import C1, C2, C3, sh_basis
+from ..sh import C1, sh_basis
 
 HIGHEST = 3  # degree of 3DGS's files
 
-STEPS = (np.float32(1), np.float32(16))  # ridges tried, in units of the least one
-FIRST_STEP = np.float32(4)  # ridge of the first fit, whose errors give the robust weights
-FEW = np.float32(10)  # observations; below it the least ridge grows: one wrong among five would lead it astray
-NARROW = np.float32(0.1)  # radians: of a much narrower cone, differences are noise that slopes would blow up
-CUT = np.float32(3)  # robust scale in σ
-POOLED = np.float32(10)  # observations' worth of σ_0 in a Gaussian's own σ
-GAIN = np.float32(1.02)  # the constant's squared error must exceed a fit's by this
-COLLINEAR = np.float32(1e-3)  # least ratio of the variances of the directions across and along their main axis
-SAME = np.float32(1e-5)  # scatter of directions, C1² square radians: below it (0.4°), they are one
-LEAST_RIDGE = np.float32(2e-6)  # of A's largest diagonal term, for float32
-LEAST_LEFT = np.float32(1e-3)  # of 1 − leverage
-HALVINGS = 20  # of the interval that holds a median
+# Of the ridge, in observations, for a cone of directions of about 60° (see fit_harmonics): 0.2 is best where colours
+# have noise alone, but painted views are wrong together (`make bench-harmonics`)
+FLOOR = 20.0
+STEPS = (1, 16)  # ridges tried, in units of the least one
+FIRST_STEP = 4  # ridge of the first fit, whose errors give the robust weights
+FEW = 10  # observations; below it the least ridge grows: one wrong among five would lead it astray
+NARROW = 0.1  # radians: of a much narrower cone, differences are noise that slopes would blow up
+CUT = 3  # robust scale in σ
+POOLED = 10  # observations' worth of σ_0 in a Gaussian's own σ
+GAIN = 1.02  # the constant's squared error must exceed a fit's by this
+COLLINEAR = 1e-3  # least ratio of the variances of the directions across and along their main axis
+SAME = 1e-5  # scatter of directions, C1² square radians: below it (0.4°), they are one
+LEAST_RIDGE = 2e-6  # of A's largest diagonal term
+LEAST_LEFT = 1e-3  # of 1 − leverage
+TINY = 1e-12  # sum of weights: nothing was observed
 MAD = 1.4826  # median absolute deviation → standard deviation
 LEAST_SIGMA = 1.0 / 255  # of 8-bit colours
 SAMPLE = 1 << 14  # observations that suffice for σ_0: its error is about 1 %
-
-LANES = 16
-K = 15  # coefficients above degree 0
-# Scratch planes of 16 lanes. Per observation: basis differences, residual colour, weights, leave-one-out error
-RESIDUAL, GIVEN, WEIGHT, ERROR, STAGED = 15 * LANES, 18 * LANES, 19 * LANES, 20 * LANES, 21 * LANES
-# Per group: A (packed rows), b, then what is made of them
-NORMAL, RIGHT = 0, 120 * LANES
-LOW, INVERSE, PROJECTED = 165 * LANES, 285 * LANES, 405 * LANES
-COEFFICIENTS, ANCHOR, TOWARDS, COLOUR = 450 * LANES, 495 * LANES, 510 * LANES, 513 * LANES
-SUM_ERROR, SUM_LEVERAGE = 516 * LANES, 519 * LANES  # a plane per degree
-MOMENT, MEAN = 522 * LANES, 537 * LANES  # Σ w x, and L⁻¹ of their mean
-OFFSET = 552 * LANES  # of the views' colours
-TOTAL, SHARE, RIDGE, BEST, FOUND, CHOSEN, RANK, GROUP = range(555 * LANES, 563 * LANES, LANES)
-
-ZERO, HALF, ONE, HUGE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e30), np.float32(1e-12)
-F1 = np.float32(C1)
-F2, F3 = tuple(np.float32(c) for c in C2), tuple(np.float32(c) for c in C3)
-TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
-LOG2E = np.float32(math.log2(math.e))
+ROUNDED = 4  # numbers of observations are rounded up to its multiples, so that more Gaussians are solved together
+AT_ONCE = 1 << 14  # observations that are solved together at most: 2 MB of basis values
 
 
 class Reason(IntEnum):
@@ -73,10 +56,9 @@ class Reason(IntEnum):
 class HarmonicsSettings:
     """How strongly the colours of few directions are held to the reference's colour."""
 
-    floor: float = 0.2  # of the ridge, in observations, for a cone of directions of about 60° (see fit_harmonics)
-    offset: bool = False  # fit along, and leave out, what all views are off by against the reference
+    offset: bool = False  # fit along, and leave out, what all views are off by; bears wrong light, costs accuracy
     anchored: bool = True  # the basis is Y(ω) − Y(ω_0); False: Y(ω), as printed, which misses c_0 in ω_0 itself
-    ridge: float | None = None  # this ridge and the highest degree for all, the paper's weights: nothing is chosen
+    ridge: float | None = None  # observations; this and the highest degree for all, chosen per Gaussian if None
 
 
 @dataclass(frozen=True)
@@ -107,35 +89,6 @@ class HarmonicsFit:
         return {reason.name.lower().replace("_", " "): int(found[reason]) for reason in Reason}
 
 
-def rotate_sh(
-    sh: np.ndarray,  # [N, K, 3], K = 1, 4, 9 or 16
-    rotation: np.ndarray,  # [3, 3] or [N, 3, 3] proper or improper, from the old frame to the new one
-) -> np.ndarray:
-    """Coefficients [N, K, 3], of `sh`'s type, of the colours that are seen along R ω as `sh`'s are along ω.
-
-    A rotation maps every band to itself (Wigner 1931): Y(R ω) = D(R) Y(ω). Evaluated in fixed directions, that is a
-    small exact system for the orthogonal matrix D; no recursion is needed up to degree 3.
-    """
-    degree = round(sh.shape[1] ** 0.5) - 1
-    points = _spread_directions(32)
-    before = sh_basis(points, degree)
-    after = sh_basis(points @ np.swapaxes(np.asarray(rotation, np.float64), -1, -2), degree)
-    rotated = np.array(sh)
-    for d in range(1, degree + 1):
-        band = slice(d * d, (d + 1) ** 2)
-        wigner = np.swapaxes(np.linalg.pinv(before[:, band]) @ after[..., band], -1, -2)
-        rotated[:, band] = wigner @ sh[:, band]
-    return rotated
-
-
-def _spread_directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors all round (a Fibonacci spiral)."""
-    k = np.arange(count) + 0.5
-    z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))
-    across = np.sqrt(1 - z * z)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), z], -1)
-
-
 def gather_observations(
     count: int,  # Gaussians
     views: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],  # rows [m] without repetition, directions, colours
@@ -159,8 +112,9 @@ def fit_harmonics(
     observations: Observations,
     degree: int = HIGHEST,  # the highest that is tried
     settings: HarmonicsSettings = HarmonicsSettings(),
+    floor: float = FLOOR,
 ) -> HarmonicsFit:
-    """SH coefficients by robust, anchored, regularised least squares (paper supplementary, METHOD section 6).
+    """SH coefficients by robust, anchored, regularised least squares (paper supplementary; docs/method.md).
 
     1. The paper's weights e_ω, with σ_0 from the median of all residuals.
     2. A first fit. Its leave-one-out errors give each Gaussian's own σ and weights 1 / (1 + (error / CUT σ)²)²
@@ -209,30 +163,24 @@ def fit_harmonics(
         np.zeros(n, np.uint8),
         sigma,
     )
-    order = np.argsort(counts, kind="stable")  # lanes of one group have about as many observations
-    run_ranges(
-        _fit_groups,
-        -(-n // LANES),
-        order,
-        offsets,
-        directions,
-        colours,
-        weights,
-        anchors,
-        anchor_directions,
-        degree,
-        np.float32(sigma),
-        np.float32(settings.floor),
-        settings.offset,
-        settings.anchored,
-        np.float32(-1 if settings.ridge is None else settings.ridge),
-        fit.sh,
-        fit.degree,
-        fit.error,
-        fit.rank,
-        fit.reasons,
-    )
+    padded = np.maximum(-(-counts // ROUNDED), 1) * ROUNDED
+    if not m:  # one that no Gaussian has
+        directions, colours, weights = (np.zeros((1, *a.shape[1:]), np.float32) for a in (directions, colours, weights))
+
+    def solve(rows: np.ndarray) -> None:
+        batch = _gathered(rows, padded[rows[0]], offsets, directions, colours, weights)
+        _fit_batch(rows, batch, anchors[rows], anchor_directions[rows], degree, settings, floor, fit)
+
+    parallel_map(solve, _batches(padded))
     return fit
+
+
+def _batches(padded: np.ndarray) -> list[np.ndarray]:
+    """Rows of Gaussians with as many observations, a part of them at a time."""
+    order = np.argsort(padded, kind="stable")
+    alike = np.split(order, np.flatnonzero(np.diff(padded[order])) + 1) if len(order) else []
+    sizes = [max(1, AT_ONCE // int(padded[rows[0]])) for rows in alike]
+    return [rows[at : at + size] for rows, size in zip(alike, sizes) for at in range(0, len(rows), size)]
 
 
 def _sigma_of(
@@ -251,381 +199,181 @@ def _sigma_of(
     return max(MAD * float(np.median(sizes)), LEAST_SIGMA)
 
 
-@exact_kernel
-def _fit_groups(
-    lo,
-    hi,
-    order,
-    offsets,
-    directions,
-    colours,
-    weights,
-    anchors,
-    anchor_directions,
-    degree,
-    sigma,
-    floor,
-    offset,
-    anchored,
-    ridge,  # < 0: chosen per Gaussian
-    sh,
-    degrees,
-    errors,
-    ranks,
-    reasons,
-):
-    """Fit groups lo … hi of 16 Gaussians in `order`."""
-    k = (degree + 1) * (degree + 1) - 1
-    last = order[min(hi * LANES, len(order)) - 1]
-    staged = np.zeros(max(1, offsets[last + 1] - offsets[last]) * STAGED, np.float32)
-    s = np.zeros(GROUP, np.float32)
-    for group in range(lo, hi):
-        rows = order[group * LANES : (group + 1) * LANES]
-        count = _stage(rows, offsets, directions, colours, weights, anchors, anchor_directions, staged, s)
-        _expand(count, degree, sigma, anchored, staged, s)
-        _normal_equations(count, k, offset, staged, s)
-        if ridge < ZERO and degree > 0:
-            _set_ridge(FIRST_STEP * floor, s)
-            _factorise(k, ONE, s)
-            _leave_one_out(count, degree, staged, s)
-            _reweigh(count, sigma, staged, s)
-            _normal_equations(count, k, offset, staged, s)
-        _start_constant(count, ridge < ZERO, staged, s)
-        if degree > 0:
-            _rank_test(s)
-        if degree > 0 and ridge < ZERO:
-            _set_ridge(floor, s)
-            for step in STEPS:
-                _factorise(k, step, s)
-                _leave_one_out(count, degree, staged, s)
-                for d in range(1, degree + 1):
-                    _keep_better(d, s)
-        elif degree > 0:
-            store16(s, RIDGE, splat16(ridge))
-            _factorise(k, ONE, s)
-            _leave_one_out(count, degree, staged, s)
-            _keep_better(degree, s)
-        for lane in range(len(rows)):
-            i = rows[lane]
-            for c in range(3):
-                constant = anchors[i, c] - float32(0.5)
-                for j in range(k):
-                    h = s[COEFFICIENTS + (3 * j + c) * LANES + lane]
-                    sh[i, 1 + j, c] = h
-                    constant -= h * s[ANCHOR + j * LANES + lane]
-                sh[i, 0, c] = constant / float32(SH_C0)
-            degrees[i] = s[CHOSEN + lane]
-            ranks[i] = s[RANK + lane]
-            errors[i] = math.sqrt(s[FOUND + lane])
-            if s[TOTAL + lane] <= TINY:
-                reasons[i] = Reason.UNOBSERVED
-            elif s[CHOSEN + lane] > ZERO:
-                reasons[i] = Reason.VIEW_DEPENDENT
-            elif s[BEST + lane] < ZERO:
-                reasons[i] = Reason.ONE_DIRECTION
-            else:
-                reasons[i] = Reason.CONSTANT
+class _Batch(NamedTuple):
+    """Observations of B Gaussians, V of each; those that do not count have the weight 0."""
+
+    directions: np.ndarray  # [B, V, 3] float64
+    colours: np.ndarray  # [B, V, 3]
+    weights: np.ndarray  # [B, V]
 
 
-@exact_kernel
-def _stage(rows, offsets, directions, colours, weights, anchors, anchor_directions, staged, s):
-    """Observations into lanes: directions (in the place of the basis), residuals, weights. The most of any lane."""
-    first, end = np.zeros(LANES, np.int64), np.zeros(LANES, np.int64)  # lanes without a Gaussian stay empty
-    count = int64(0)
-    for lane in range(len(rows)):
-        i = rows[lane]
-        first[lane], end[lane] = offsets[i], offsets[i + 1]
-        count = max(count, offsets[i + 1] - offsets[i])
-        for c in range(3):
-            store1(s, TOWARDS + c * LANES + lane, anchor_directions[i, c])
-            store1(s, COLOUR + c * LANES + lane, anchors[i, c])
-    for v in range(count):
-        for lane in range(LANES):
-            at, o = v * STAGED + lane, load1(first, lane) + v
-            used = o < load1(end, lane) and weights[o] > ZERO
-            if used:
-                x, y, z = directions[o, 0], directions[o, 1], directions[o, 2]
-                r, g, b = colours[o, 0], colours[o, 1], colours[o, 2]
-                used = math.isfinite(x + y + z + r + g + b + weights[o])
-            if used:
-                store1(staged, at, x)
-                store1(staged, at + LANES, y)
-                store1(staged, at + 2 * LANES, z)
-                store1(staged, at + RESIDUAL, r)
-                store1(staged, at + RESIDUAL + LANES, g)
-                store1(staged, at + RESIDUAL + 2 * LANES, b)
-                store1(staged, at + GIVEN, weights[o])
-            else:
-                for c in range(3):
-                    store1(staged, at + c * LANES, load1(s, TOWARDS + c * LANES + lane))
-                    store1(staged, at + RESIDUAL + c * LANES, load1(s, COLOUR + c * LANES + lane))
-                store1(staged, at + GIVEN, ZERO)
-    return count
+def _gathered(
+    rows: np.ndarray,
+    count: int,  # V
+    offsets: np.ndarray,
+    directions: np.ndarray,
+    colours: np.ndarray,
+    weights: np.ndarray,
+) -> _Batch:
+    places = offsets[rows, None] + np.arange(count)
+    there = places < offsets[rows + 1, None]
+    places = np.where(there, places, 0)
+    towards, seen, given = directions[places], colours[places], weights[places]
+    there &= np.isfinite(given) & (given > 0) & np.isfinite(towards).all(-1) & np.isfinite(seen).all(-1)
+    towards, seen = (np.where(there[..., None], a, 0).astype(np.float64) for a in (towards, seen))
+    return _Batch(towards, seen, np.where(there, given, 0).astype(np.float64))
 
 
-@exact_kernel
-def _expand(count, degree, sigma, anchored, staged, s):
-    """Y(ω) − Y(ω_0) in the place of the directions, and the paper's weights e_ω times the given ones."""
-    _basis(degree, s, TOWARDS, s, ANCHOR)
-    k = (degree + 1) * (degree + 1) - 1
-    for j in range(0 if anchored else k):
-        store16(s, ANCHOR + j * LANES, splat16(ZERO))
-    scale = -float32(0.5) * LOG2E / (sigma * sigma)
-    for v in range(count):
-        at = v * STAGED
-        x = load16(staged, at) - load16(s, TOWARDS)
-        y = load16(staged, at + LANES) - load16(s, TOWARDS + LANES)
-        z = load16(staged, at + 2 * LANES) - load16(s, TOWARDS + 2 * LANES)
-        apart = fma16(x, x, fma16(y, y, z * z)) * -LOG2E  # |ω − ω_0|² = 2 (1 − ω·ω_0)
-        r = load16(staged, at + RESIDUAL) - load16(s, COLOUR)
-        g = load16(staged, at + RESIDUAL + LANES) - load16(s, COLOUR + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES) - load16(s, COLOUR + 2 * LANES)
-        store16(staged, at + RESIDUAL, r)
-        store16(staged, at + RESIDUAL + LANES, g)
-        store16(staged, at + RESIDUAL + 2 * LANES, b)
-        size = fma16(r, r, fma16(g, g, b * b))
-        weight = exp2_16(size * scale * exp2_16(apart))
-        store16(staged, at + WEIGHT, load16(staged, at + GIVEN) * weight)
-        _basis(degree, staged, at, staged, at)
-        for j in range(k):
-            store16(staged, at + j * LANES, load16(staged, at + j * LANES) - load16(s, ANCHOR + j * LANES))
+class _Equations(NamedTuple):
+    """Weighted least squares of a batch; with an offset, everything is taken from its weighted mean."""
+
+    x: np.ndarray  # [B, V, K] basis differences
+    r: np.ndarray  # [B, V, 3] residual colours
+    weight: np.ndarray  # [B, V]
+    total: np.ndarray  # [B] Σ weight
+    share: np.ndarray  # [B] 1 / Σ weight with an offset, else 0
+    matrix: np.ndarray  # [B, K, K] A = Σ w x xᵀ
+    right: np.ndarray  # [B, K, 3] b = Σ w x rᵀ
 
 
-@exact_kernel
-def _basis(degree, source, start, out, at):
-    """Planes of Y_k, k ≥ 1, of three planes of directions, which may lie where the first three of them go."""
-    x, y, z = load16(source, start), load16(source, start + LANES), load16(source, start + 2 * LANES)
-    if degree > 0:
-        store16(out, at, y * -F1)
-        store16(out, at + LANES, z * F1)
-        store16(out, at + 2 * LANES, x * -F1)
-    if degree > 1:
-        xx, yy, zz = x * x, y * y, z * z
-        store16(out, at + 3 * LANES, x * y * F2[0])
-        store16(out, at + 4 * LANES, y * z * F2[1])
-        store16(out, at + 5 * LANES, (zz * TWO - xx - yy) * F2[2])
-        store16(out, at + 6 * LANES, x * z * F2[3])
-        store16(out, at + 7 * LANES, (xx - yy) * F2[4])
-        if degree > 2:
-            store16(out, at + 8 * LANES, y * (xx * THREE - yy) * F3[0])
-            store16(out, at + 9 * LANES, x * y * z * F3[1])
-            store16(out, at + 10 * LANES, y * (zz * FOUR - xx - yy) * F3[2])
-            store16(out, at + 11 * LANES, z * (zz * TWO - (xx + yy) * THREE) * F3[3])
-            store16(out, at + 12 * LANES, x * (zz * FOUR - xx - yy) * F3[4])
-            store16(out, at + 13 * LANES, z * (xx - yy) * F3[5])
-            store16(out, at + 14 * LANES, x * (xx - yy * THREE) * F3[6])
+def _equations(basis: np.ndarray, residuals: np.ndarray, weight: np.ndarray, offset: bool) -> _Equations:
+    total = np.maximum(weight.sum(1), TINY)
+    share = offset / total
+    if offset:
+        means = (weight * share[:, None])[:, None]
+        basis, residuals = basis - means @ basis, residuals - means @ residuals
+    weighted = np.swapaxes(basis * weight[..., None], 1, 2)
+    return _Equations(basis, residuals, weight, total, share, weighted @ basis, weighted @ residuals)
 
 
-@exact_kernel
-def _normal_equations(count, k, offset, staged, s):
-    """A = Σ w x xᵀ (packed rows), b = Σ w x rᵀ, Σ w, with the views' common offset, if any, eliminated."""
-    for p in range(NORMAL, LOW, LANES):
-        store16(s, p, splat16(ZERO))
-    for p in range(MOMENT, MOMENT + K * LANES, LANES):
-        store16(s, p, splat16(ZERO))
-    total, red, green, blue = splat16(ZERO), splat16(ZERO), splat16(ZERO), splat16(ZERO)
-    for v in range(count):
-        at = v * STAGED
-        w = load16(staged, at + WEIGHT)
-        r = load16(staged, at + RESIDUAL)
-        g = load16(staged, at + RESIDUAL + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES)
-        total, red, green, blue = total + w, fma16(w, r, red), fma16(w, g, green), fma16(w, b, blue)
-        p, q, m = NORMAL, RIGHT, MOMENT
-        for i in range(k):
-            wx = w * load16(staged, at + i * LANES)
-            for j in range(i + 1):
-                store16(s, p, fma16(wx, load16(staged, at + j * LANES), load16(s, p)))
-                p += LANES
-            store16(s, q, fma16(wx, r, load16(s, q)))
-            store16(s, q + LANES, fma16(wx, g, load16(s, q + LANES)))
-            store16(s, q + 2 * LANES, fma16(wx, b, load16(s, q + 2 * LANES)))
-            store16(s, m, wx + load16(s, m))
-            q += 3 * LANES
-            m += LANES
-    total = max16(total, TINY)
-    share = splat16(ONE if offset else ZERO) / total
-    red, green, blue = red * share, green * share, blue * share
-    store16(s, TOTAL, total)
-    store16(s, SHARE, share)
-    store16(s, OFFSET, red)
-    store16(s, OFFSET + LANES, green)
-    store16(s, OFFSET + 2 * LANES, blue)
-    p, q = NORMAL, RIGHT
-    for i in range(k):
-        moment = load16(s, MOMENT + i * LANES)
-        for j in range(i + 1):
-            store16(s, p, load16(s, p) - moment * load16(s, MOMENT + j * LANES) * share)
-            p += LANES
-        store16(s, q, load16(s, q) - moment * red)
-        store16(s, q + LANES, load16(s, q + LANES) - moment * green)
-        store16(s, q + 2 * LANES, load16(s, q + 2 * LANES) - moment * blue)
-        q += 3 * LANES
+class _Fits(NamedTuple):
+    """Fits of all degrees from 1 on at one ridge."""
+
+    errors: list[np.ndarray]  # [B, V] of each degree: length of the leave-one-out error of the colour
+    ranks: list[np.ndarray]  # [B] Σ leverage
+    inverse: np.ndarray  # [B, K, K] of the Cholesky factor L of A + ridge
+    projected: np.ndarray  # [B, K, 3] L⁻¹ b
+
+    def coefficients(self, degree: int) -> np.ndarray:
+        """[B, (degree + 1)² − 1, 3]."""
+        k = (degree + 1) ** 2 - 1
+        return np.swapaxes(self.inverse[:, :k, :k], 1, 2) @ self.projected[:, :k]
 
 
-@exact_kernel
-def _set_ridge(floor, s):
-    """The least ridge, from the directions' RMS distance from ω_0, or from their mean if there is an offset."""
-    # the first three basis functions are the direction's coordinates times ±C1
-    squares = load16(s, NORMAL) + load16(s, NORMAL + 2 * LANES) + load16(s, NORMAL + 5 * LANES)
-    total = load16(s, TOTAL)
-    distance = sqrt16(max16(squares * (ONE / (F1 * F1)) / total, TINY))
-    store16(s, RIDGE, (distance + NARROW) * floor * (splat16(FEW) / total + ONE))
+def _fits(equations: _Equations, ridge: np.ndarray, degree: int) -> _Fits:
+    """Solve for all degrees with a ridge [B] each."""
+    matrix = equations.matrix.copy()
+    diagonal = np.einsum("bkk->bk", matrix)
+    diagonal += np.maximum(np.maximum(ridge, LEAST_RIDGE * diagonal.max(1)), TINY)[:, None]
+    inverse = _inverse(np.linalg.cholesky(matrix))
+    projected = inverse @ equations.right
+    t = equations.x @ np.swapaxes(inverse, 1, 2)
+    left, squares = equations.r, np.broadcast_to(equations.share[:, None], equations.weight.shape)
+    errors, ranks = [], []
+    for d in range(1, degree + 1):
+        band = slice(d * d - 1, (d + 1) ** 2 - 1)
+        squares = squares + (t[..., band] ** 2).sum(-1)
+        left = left - t[..., band] @ projected[:, band]
+        errors.append(_left_out(left, equations.weight * squares))
+        ranks.append((equations.weight * squares).sum(1))
+    return _Fits(errors, ranks, inverse, projected)
 
 
-@exact_kernel
-def _factorise(k, step, s):
-    """The inverse of the Cholesky factor L of A + ridge, L⁻¹ b, and L⁻¹ of the mean basis values."""
-    largest = splat16(ZERO)
-    for i in range(k):
-        largest = max16(largest, load16(s, NORMAL + (i * (i + 3) // 2) * LANES))
-    ridge = max16(load16(s, RIDGE) * step, largest * LEAST_RIDGE)
-    for i in range(k):
-        row = i * (i + 1) // 2 * LANES
-        squares = splat16(ZERO)
-        for j in range(i):
-            column = j * (j + 1) // 2 * LANES
-            dot = splat16(ZERO)
-            for m in range(0, j * LANES, LANES):
-                dot = fma16(load16(s, LOW + row + m), load16(s, LOW + column + m), dot)
-            term = load16(s, NORMAL + row + j * LANES) - dot
-            term = term * load16(s, INVERSE + column + j * LANES)
-            store16(s, LOW + row + j * LANES, term)
-            squares = fma16(term, term, squares)
-        pivot = load16(s, NORMAL + row + i * LANES) + ridge - squares
-        inverse = splat16(ONE) / sqrt16(max16(pivot, ridge))  # exactly, no pivot is below the ridge
-        store16(s, INVERSE + row + i * LANES, inverse)
-        for j in range(i):
-            dot = splat16(ZERO)
-            for m in range(j, i):
-                dot = fma16(load16(s, LOW + row + m * LANES), load16(s, INVERSE + (m * (m + 1) // 2 + j) * LANES), dot)
-            store16(s, INVERSE + row + j * LANES, dot * inverse * -ONE)
-        for c in range(0, 3 * LANES, LANES):
-            dot = splat16(ZERO)
-            for j in range(i + 1):
-                dot = fma16(load16(s, INVERSE + row + j * LANES), load16(s, RIGHT + 3 * j * LANES + c), dot)
-            store16(s, PROJECTED + 3 * i * LANES + c, dot)
-        dot = splat16(ZERO)
-        for j in range(0, (i + 1) * LANES, LANES):
-            dot = fma16(load16(s, INVERSE + row + j), load16(s, MOMENT + j), dot)
-        store16(s, MEAN + i * LANES, dot * load16(s, SHARE))
+def _inverse(lower: np.ndarray) -> np.ndarray:
+    """[B, K, K] of lower triangular matrices; LAPACK, called for each, takes several times as long."""
+    inverse = np.zeros_like(lower)
+    for i in range(lower.shape[1]):
+        inverse[:, i, i] = 1
+        inverse[:, i, :i] = -(lower[:, i, None, :i] @ inverse[:, :i, :i])[:, 0]
+        inverse[:, i] /= lower[:, i, i, None]
+    return inverse
 
 
-@exact_kernel
-def _leave_one_out(count, degree, staged, s):
-    """Per degree: Σ w error² and Σ leverage. The errors' lengths at the highest degree are kept."""
-    for d in range(degree):
-        store16(s, SUM_ERROR + d * LANES, splat16(ZERO))
-        store16(s, SUM_LEVERAGE + d * LANES, splat16(ZERO))
-    for v in range(count):
-        at = v * STAGED
-        w = load16(staged, at + WEIGHT)
-        r = load16(staged, at + RESIDUAL) - load16(s, OFFSET)
-        g = load16(staged, at + RESIDUAL + LANES) - load16(s, OFFSET + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES) - load16(s, OFFSET + 2 * LANES)
-        squares = load16(s, SHARE)
-        p, q, i = INVERSE, PROJECTED, 0
-        for d in range(degree):
-            for _ in range(2 * d + 3):
-                t = load16(s, MEAN + i * LANES) * -ONE  # becomes (L⁻¹ (x − mean))_i
-                for j in range(0, (i + 1) * LANES, LANES):
-                    t = fma16(load16(s, p + j), load16(staged, at + j), t)
-                squares = fma16(t, t, squares)
-                r = r - t * load16(s, q)
-                g = g - t * load16(s, q + LANES)
-                b = b - t * load16(s, q + 2 * LANES)
-                i += 1
-                p += i * LANES
-                q += 3 * LANES
-            leverage = w * squares
-            left = max16(splat16(ONE) - leverage, LEAST_LEFT)
-            error = fma16(r, r, fma16(g, g, b * b)) / (left * left)
-            store16(s, SUM_ERROR + d * LANES, fma16(w, error, load16(s, SUM_ERROR + d * LANES)))
-            store16(s, SUM_LEVERAGE + d * LANES, leverage + load16(s, SUM_LEVERAGE + d * LANES))
-            store16(staged, at + ERROR, sqrt16(error))
+def _left_out(residuals: np.ndarray, leverage: np.ndarray) -> np.ndarray:
+    """[B, V] length of the error that a fit without the observation would make at it."""
+    return np.linalg.norm(residuals, axis=-1) / np.maximum(1 - leverage, LEAST_LEFT)
 
 
-@exact_kernel
-def _reweigh(count, sigma, staged, s):
-    """Robust weights from the errors and each Gaussian's own σ, drawn to σ_0 where observations are few."""
-    total, high = splat16(ZERO), splat16(ZERO)
-    for v in range(count):
-        total = total + load16(staged, v * STAGED + GIVEN)
-        high = max16(high, load16(staged, v * STAGED + ERROR))
-    low, half = splat16(ZERO), total * HALF
-    for _ in range(HALVINGS):  # towards the weighted median
-        middle, below = (low + high) * HALF, splat16(ZERO)
-        for v in range(count):
-            error, given = load16(staged, v * STAGED + ERROR), load16(staged, v * STAGED + GIVEN)
-            below = below + where_greater(middle, error, given, splat16(ZERO))
-        low, high = where_greater(half, below, middle, low), where_greater(half, below, high, middle)
-    own = high * float32(MAD)
-    square = (total * own * own + splat16(POOLED * sigma * sigma)) / (total + POOLED) * (CUT * CUT)
-    for v in range(count):
-        error = load16(staged, v * STAGED + ERROR)
-        t = error * error / square + ONE
-        store16(staged, v * STAGED + WEIGHT, load16(staged, v * STAGED + GIVEN) / (t * t))
+def _fit_batch(
+    rows: np.ndarray,
+    batch: _Batch,
+    anchors: np.ndarray,  # [B, 3]
+    towards: np.ndarray,  # [B, 3]
+    degree: int,
+    settings: HarmonicsSettings,
+    floor: float,
+    fit: HarmonicsFit,  # gets the rows
+) -> None:
+    anchors, towards = anchors.astype(np.float64), towards.astype(np.float64)
+    at_anchor = sh_basis(towards, degree)[:, 1:]
+    basis = sh_basis(batch.directions, degree)[..., 1:]
+    if settings.anchored:
+        basis = basis - at_anchor[:, None]
+    residuals = batch.colours - anchors[:, None]
+    # the paper's weights e_ω; |ω − ω_0|² = 2 (1 − ω·ω_0)
+    apart = ((batch.directions - towards[:, None]) ** 2).sum(-1)
+    weight = batch.weights * np.exp(-0.5 * (residuals**2).sum(-1) / fit.sigma**2 * np.exp(-apart))
+    choose = settings.ridge is None
+    equations = _equations(basis, residuals, weight, settings.offset)
+    if choose and degree:
+        first = _fits(equations, FIRST_STEP * _least_ridge(equations, floor), degree)
+        weight = batch.weights * _robust(first.errors[-1], batch.weights, fit.sigma)
+        equations = _equations(basis, residuals, weight, settings.offset)
+
+    def mean(errors: np.ndarray) -> np.ndarray:
+        return (equations.weight * errors**2).sum(1) / equations.total
+
+    error = mean(_left_out(equations.r, equations.weight * equations.share[:, None]))
+    best = error / GAIN if choose else np.full(len(rows), np.inf)
+    posed = _spans_a_patch(equations, towards) if degree else np.ones(len(rows), bool)
+    found, chosen, rank = np.zeros((*basis.shape[::2], 3)), np.zeros(len(rows), int), np.zeros(len(rows))
+    for step in (STEPS if choose else (1,)) if degree else ():
+        ridge = step * _least_ridge(equations, floor) if choose else np.full(len(rows), settings.ridge, float)
+        fits = _fits(equations, ridge, degree)
+        for d in range(1 if choose else degree, degree + 1):
+            here = mean(fits.errors[d - 1])
+            better = posed & (here < best)
+            best[better], error[better], chosen[better] = here[better], here[better], d
+            rank[better] = fits.ranks[d - 1][better]
+            found[better] = 0
+            found[better, : (d + 1) ** 2 - 1] = fits.coefficients(d)[better]
+    fit.sh[rows, 1:] = found
+    level = anchors - 0.5
+    fit.sh[rows, 0] = (level - np.einsum("bk,bkc->bc", at_anchor, found) if settings.anchored else level) / SH_C0
+    fit.degree[rows], fit.error[rows], fit.rank[rows] = chosen, np.sqrt(error), rank
+    fit.reasons[rows] = np.select(
+        [equations.total <= TINY, chosen > 0, ~posed],
+        [Reason.UNOBSERVED, Reason.VIEW_DEPENDENT, Reason.ONE_DIRECTION],
+        Reason.CONSTANT,
+    )
 
 
-@exact_kernel
-def _start_constant(count, choose, staged, s):
-    """The constant colour as the first candidate."""
-    sum_ = splat16(ZERO)
-    for v in range(count):
-        at = v * STAGED
-        r = load16(staged, at + RESIDUAL) - load16(s, OFFSET)
-        g = load16(staged, at + RESIDUAL + LANES) - load16(s, OFFSET + LANES)
-        b = load16(staged, at + RESIDUAL + 2 * LANES) - load16(s, OFFSET + 2 * LANES)
-        w = load16(staged, at + WEIGHT)
-        left = max16(splat16(ONE) - w * load16(s, SHARE), LEAST_LEFT)
-        sum_ = fma16(w, fma16(r, r, fma16(g, g, b * b)) / (left * left), sum_)
-    error = sum_ / load16(s, TOTAL)
-    store16(s, FOUND, error)
-    store16(s, BEST, error * (ONE / GAIN) if choose else splat16(HUGE))
-    store16(s, CHOSEN, splat16(ZERO))
-    store16(s, RANK, splat16(ZERO))
-    for p in range(COEFFICIENTS, ANCHOR, LANES):
-        store16(s, p, splat16(ZERO))
+def _least_ridge(equations: _Equations, floor: float) -> np.ndarray:
+    """[B], from the directions' RMS distance from ω_0, or from their mean if there is an offset."""
+    squares = np.einsum("bkk->b", equations.matrix[:, :3, :3]) / C1**2  # degree 1 holds the direction's coordinates
+    distance = np.sqrt(squares / equations.total)
+    return floor * (distance + NARROW) * (1 + FEW / equations.total)
 
 
-@exact_kernel
-def _rank_test(s):
-    """No candidate can win where the directions, seen along ω_0, lie in a point or on a line.
+def _robust(errors: np.ndarray, given: np.ndarray, sigma: float) -> np.ndarray:
+    """[B, V] weights from the errors and each Gaussian's own σ, drawn to σ_0 where observations are few."""
+    errors = np.where(given > 0, errors, 0)
+    order, total = np.argsort(errors, axis=1), given.sum(1)
+    middle = (np.cumsum(np.take_along_axis(given, order, 1), 1) >= total[:, None] / 2).argmax(1)  # weighted median
+    own = MAD * errors[np.arange(len(errors)), order[np.arange(len(order)), middle]]
+    square = CUT**2 * (total * own**2 + POOLED * sigma**2) / (total + POOLED)
+    return 1 / (1 + errors**2 / square[:, None]) ** 2
 
-    A's first three rows are the scatter of ω about ω_0 (about their mean if there is an offset). Seen along ω_0, it
-    has one eigenvalue 0, the sum of the others in its trace and their product in its principal minors.
+
+def _spans_a_patch(equations: _Equations, towards: np.ndarray) -> np.ndarray:
+    """[B] bool: the directions, seen along ω_0, lie neither in a point nor on a line.
+
+    A's first three rows are their scatter about ω_0 (about their mean if there is an offset). Seen along ω_0, it has
+    one eigenvalue 0, the sum of the others in its trace and their product in its principal minors.
     """
-    a, b, c = load16(s, TOWARDS + LANES) * -ONE, load16(s, TOWARDS + 2 * LANES), load16(s, TOWARDS) * -ONE
-    aa, ab, bb = load16(s, NORMAL), load16(s, NORMAL + LANES), load16(s, NORMAL + 2 * LANES)
-    ac, bc, cc = load16(s, NORMAL + 3 * LANES), load16(s, NORMAL + 4 * LANES), load16(s, NORMAL + 5 * LANES)
-    p = fma16(aa, a, fma16(ab, b, ac * c))
-    q = fma16(ab, a, fma16(bb, b, bc * c))
-    r = fma16(ac, a, fma16(bc, b, cc * c))
-    along = fma16(p, a, fma16(q, b, r * c))
-    aa, ab = aa - a * p * TWO + a * a * along, ab - a * q - b * p + a * b * along
-    bb, ac = bb - b * q * TWO + b * b * along, ac - a * r - c * p + a * c * along
-    cc, bc = cc - c * r * TWO + c * c * along, bc - b * r - c * q + b * c * along
-    trace = aa + bb + cc
-    minors = aa * bb - ab * ab + aa * cc - ac * ac + bb * cc - bc * bc
-    best = where_greater(minors, trace * trace * COLLINEAR, load16(s, BEST), splat16(-ONE))
-    store16(s, BEST, where_greater(trace, load16(s, TOTAL) * SAME, best, splat16(-ONE)))
-
-
-@exact_kernel
-def _keep_better(degree, s):
-    """Take this degree's fit where it predicts better than what was best so far."""
-    k = (degree + 1) * (degree + 1) - 1
-    error, best = load16(s, SUM_ERROR + (degree - 1) * LANES) / load16(s, TOTAL), load16(s, BEST)
-    store16(s, BEST, min16(error, best))
-    store16(s, FOUND, where_greater(best, error, error, load16(s, FOUND)))
-    store16(s, CHOSEN, where_greater(best, error, splat16(float32(degree)), load16(s, CHOSEN)))
-    leverage = load16(s, SUM_LEVERAGE + (degree - 1) * LANES)
-    store16(s, RANK, where_greater(best, error, leverage, load16(s, RANK)))
-    for j in range(K):
-        for c in range(0, 3 * LANES, LANES):
-            dot = splat16(ZERO)
-            for i in range(j, k):
-                row = i * (i + 1) // 2 * LANES
-                dot = fma16(load16(s, INVERSE + row + j * LANES), load16(s, PROJECTED + 3 * i * LANES + c), dot)
-            at = COEFFICIENTS + 3 * j * LANES + c
-            store16(s, at, where_greater(best, error, dot, load16(s, at)))
+    along = towards[:, [1, 2, 0]] * [-1, 1, -1]  # as Y_1 … Y_3 order and sign the coordinates
+    across = np.eye(3) - along[:, :, None] * along[:, None]
+    scatter = across @ equations.matrix[:, :3, :3] @ across
+    trace = np.einsum("bkk->b", scatter)
+    minors = (trace**2 - np.einsum("bkl,blk->b", scatter, scatter)) / 2
+    return (minors > COLLINEAR * trace**2) & (trace > SAME * equations.total)

@@ -1,4 +1,11 @@
-"""A kd-tree over a picture's patches whose leaves are blocks of 16, so that a leaf is compared at once."""
+"""A kd-tree over a picture's patches whose leaves are blocks of 16, so that a leaf is compared at once.
+
+Our own, as scipy's cKDTree was measured to take longer: it answers for one patch at a time, where sweeps also look into
+the leaves of their neighbours' sources (He & Sun 2012). With cKDTree's guesses in place of the tree, the fields of two
+photographs of 1080p were as near to the exact ones after 1.8–2 times the CPU time (0.73 -> 1.3–1.4 s, one thread). The
+charts of five removals (160–480 px) cost 2–6 % more after as many sweeps; to cost as little they took twice as many,
+and 1.3–2.4 times the time (16–68 -> 23–164 ms).
+"""
 
 from __future__ import annotations
 

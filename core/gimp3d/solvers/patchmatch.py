@@ -1,4 +1,4 @@
-"""Nearest-neighbour fields: a kd-tree's guesses, propagated and refined by PatchMatch sweeps, from coarse to fine.
+"""Nearest-neighbour fields: a kd-tree's guesses, propagated and refined by PatchMatch sweeps.
 
 Sources come from a tree over the patches' main components and from the leaves of the neighbours' sources (He & Sun
 2012), then from propagation and random search (Barnes 2009; paper Algorithm 2 with its loop mended). The target is
@@ -27,7 +27,11 @@ from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surfac
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
-SMALLEST = 32  # px, no level is smaller
+TRUNCATION = 8.0  # px; offsets that differ by more are incoherent: coherence is local, not of the whole image
+GRID = 2  # px between the sources that the tree holds; sweeps look at those between
+TREE_SWEEPS = 2  # the first ones, which look into the neighbours' leaves of the tree
+SURFACE_SWEEPS = 3  # along a surface, after all others
+REACH = 4  # px, of the random search round the best source
 NO_LOOKS, NO_SUPPORT = np.empty(0, np.float32), np.empty((0, 0), np.uint8)
 IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
 SAME = np.float32(255.0**-2 / 4)  # half a grey level: the tree is not asked for better, or plain areas lose coherence
@@ -36,18 +40,12 @@ TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only
 
 @dataclass(frozen=True)
 class PatchMatchSettings:
-    """Costs are mean squared differences of colours in [0, 1]; lengths in pixels."""
+    """Costs are mean squared differences of colours in [0, 1]."""
 
-    patch: AtLeastOne = 5  # side, odd (paper 4.1)
-    coherence: float = 0.001  # λ_s, weight of the spatial term (paper 4.1)
-    truncation: float = 8.0  # offsets that differ by more are incoherent (METHOD section 4: local, not image-sized)
-    levels: AtLeastOne = 1  # of the pyramid, at most
-    grid: AtLeastOne = 2  # spacing of the sources that the tree holds; sweeps look at those between
-    tree_sweeps: int = 2  # that look into the neighbours' leaves of the tree
-    sweeps: int = 4  # per level, those among them
-    surface_sweeps: int = 3  # along a surface, after all others
-    reach: int = 4  # of the random search round the best source
-    seed: Seed = 0
+    patch: AtLeastOne = 5  # px, side, odd (paper 4.1); larger ones tell more apart and reach less close to the hole
+    coherence: float = 0.001  # λ_s (paper 4.1); higher copies larger pieces that fit less
+    sweeps: int = 4  # number; more come nearer to the best sources and take as much longer
+    seed: Seed = 0  # of the random search
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def nearest_neighbour_field(
     settings: PatchMatchSettings = PatchMatchSettings(),
     surface: Surface | None = None,  # what the picture shows
 ) -> NearestNeighbourField:
-    """The source patch that each target patch resembles most, found from the coarsest level to the finest.
+    """The source patch that each target patch resembles most.
 
     Minimises (1 − λ_s)·appearance + λ_s·spatial + penalty (paper eq. 8). Appearance is the mean squared
     difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
@@ -81,32 +79,20 @@ def nearest_neighbour_field(
     pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
 
     With a surface patches lie on its tangent planes, sources on other planes or of other orientations cost more, and
-    those seen more than twice as large or small are not taken (METHOD section 4) – unless there is no other.
+    those seen more than twice as large or small are not taken – unless there is no other.
     """
     radius = settings.patch // 2
     while radius > 0 and not (source & patch_centres(~target, radius)).any():
         radius -= 1
     extra = np.zeros(target.shape, np.float32) if penalty is None else penalty.astype(np.float32)
-    levels = [(image.astype(np.float32) / 255, target, source, extra)]
-    while len(levels) < settings.levels and min(target.shape) >> len(levels) >= SMALLEST:
-        smaller = _halved(*levels[-1])
-        if not (smaller[2] & patch_centres(~smaller[1], radius)).any():
-            break
-        levels.append(smaller)
-    field: NearestNeighbourField | None = None
-    for picture, inside, centres, extra in reversed(levels):
-        allowed = centres & patch_centres(~inside, radius)
-        start = None if field is None else upsampled(field, inside)
-        patches = lay_out(picture, radius)
-        index = index_patches(patches, allowed, settings.grid) if allowed.any() and inside.any() else None
-        field = refined(start, patches, inside, allowed, settings, extra, index)
-    assert field is not None
+    allowed = source & patch_centres(~target, radius)
+    patches = lay_out(image.astype(np.float32) / 255, radius)
+    index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
+    field = refined(None, patches, target, allowed, settings, extra, index)
     if surface is None or not field.found.any():
         return field
-    patches = lay_out(levels[0][0], radius)
-    allowed = source & patch_centres(~target, radius)
-    reach = replace(settings, sweeps=settings.surface_sweeps, reach=max(target.shape) // 4)
-    along = refined(field, patches, target, allowed, reach, levels[0][3], surface=surface)
+    longer = replace(settings, sweeps=SURFACE_SWEEPS)
+    along = refined(field, patches, target, allowed, longer, extra, surface=surface, reach=max(target.shape) // 4)
     kept = along.cost < IMPOSSIBLE
     rows, cols, cost = (np.where(kept, a, b) for a, b in zip(_arrays(along), _arrays(field)))
     return NearestNeighbourField(rows, cols, cost, radius)
@@ -123,17 +109,6 @@ def patch_centres(
     """[H, W] bool: centres of the patches that lie wholly in the image and on usable pixels."""
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return cv2.erode(usable.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
-
-
-def _halved(
-    image: np.ndarray, target: np.ndarray, source: np.ndarray, penalty: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    size = ((target.shape[1] + 1) // 2, (target.shape[0] + 1) // 2)
-
-    def shrink(a: np.ndarray) -> np.ndarray:
-        return cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-
-    return shrink(image), shrink(target) > 0, shrink(source) > 0.5, shrink(penalty)
 
 
 def upsampled(
@@ -160,6 +135,8 @@ def refined(
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
     surface: Surface | None = None,  # compare patches on its tangent planes
     usable: np.ndarray | None = None,  # [H, W] bool, pixels that slanted patches may be copied from; None: not target
+    reach: int = REACH,  # px, of the random search
+    tree_sweeps: int | None = None,  # None: TREE_SWEEPS
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
@@ -170,7 +147,7 @@ def refined(
     start = _first_guess(field, target, allowed)
     extra = np.zeros((h, w), np.float32) if penalty is None else penalty
     guides = np.empty((h, w, 0), np.float32) if guides is None else guides
-    weights = np.array([1 - settings.coherence, settings.coherence, settings.truncation**2, TIE / w], np.float32)
+    weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
     looks, number, support = NO_LOOKS, np.zeros((h, w), np.int32), NO_SUPPORT
     wanted = np.nonzero(target)
     number[wanted] = np.arange(len(wanted[0]))
@@ -180,12 +157,13 @@ def refined(
         looks = coordinates(patches, index.components, patches.starts(*wanted)).ravel()
     tree = NO_TREE if index is None else index.tree
     bands = row_bands(target)
+    tree_sweeps = TREE_SWEEPS if tree_sweeps is None else tree_sweeps
     for sweep in range(settings.sweeps):
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
-            *tree, index is not None and sweep < settings.tree_sweeps, looks, number,
+            *tree, index is not None and sweep < tree_sweeps, looks, number,
             surface is not None, *(surface or NO_SURFACE), support, ~target if usable is None else usable,
-            *start, sweep == 0, sweep % 2 == 0, settings.reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
+            *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
         parallel_map(partial(_run_band, arguments), bands)

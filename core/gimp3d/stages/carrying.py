@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from ..gaussians import Gaussians
+from ..geometry import window_mask
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import surface_depth
@@ -16,7 +17,6 @@ from ..view_state import ViewState
 from .charts import CHART, Chart
 from .completion import Completed
 from .mapping import MappingField, mapping_field, source_visibility
-from .outline import window_mask
 from .propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from .seed import colour_gaussians, seed_gaussians, settle_gaussians
 

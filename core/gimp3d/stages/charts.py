@@ -20,12 +20,12 @@ import scipy.ndimage
 from ..box import Region, in_region
 from ..camera import Camera
 from ..compute.threads import parallel_map, run_ranges
+from ..geometry import sees, surface_points, window_round
 from ..schema import AtLeastOne
 from ..solvers.thin_plate import thin_plate
 from .footprint import shows_object
-from .masks import ViewMasks, sees
+from .masks import ViewMasks
 from .mosaic import mosaic
-from .outline import surface_points, window_round
 from .witness import Says, Textures, Witness, ask, meet_range, pack
 
 VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there

@@ -11,12 +11,12 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import sees, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
 from .charts import Chart, Hits, extent, first_hits
-from .masks import ViewMasks, sees
-from .outline import window_mask
-from .selection import Fate, Selection, SelectionSettings, near_region
+from .masks import ViewMasks
+from .selection import Fate, Selection, near_region
 from .witness import Says, Witness, ask
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
@@ -92,7 +92,7 @@ def clear_air(
     """Remove what only the removal reveals, where no photo shows that anything is; and rests of the object."""
     stays = ~selection.removed
     kept = scene.take(stays)
-    near = near_region(scene, region, SelectionSettings(near=1.0))[stays]
+    near = near_region(scene, region, 1.0)[stays]
     share, hidden = observed_share(kept, near, views, witnesses)
     haze = near & kept.usable & (share < settings.observed) & (hidden > settings.shown)
     candidates = np.flatnonzero(haze)

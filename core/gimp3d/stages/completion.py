@@ -12,7 +12,7 @@ import scipy.ndimage
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..geometry import SOLID
+from ..geometry import SOLID, disparity_of, sees
 from ..presets import RemovalSettings
 from ..priors.appearance import Appearance
 from ..priors.calls import Call
@@ -22,9 +22,9 @@ from ..priors.pasting import paste_picture
 from ..view_state import ViewState
 from .charts import CHART, Chart, chart_number
 from .depth import DepthCompletion, complete_depth
-from .masks import sees
+from .evidence import gather_evidence
 from .propagate import Reference
-from .reference import disparity_of, gather_evidence, rim
+from .reference import rim
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z

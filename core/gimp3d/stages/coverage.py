@@ -10,11 +10,12 @@ import numpy as np
 
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import SOLID, dilated, window_mask
 from ..raster import Window, drawing, render_bytes, touched_window
 from ..view_state import ViewState
 from .masks import MaskSettings, ViewMasks
-from .outline import window_mask
 from .propagate import PaintedView, Reference, Rule
+from .targets import LAYER_STEP
 
 OPAQUE = 0.99  # alpha of the emptied scene below which a gap shows through
 DRAWN = 0.5  # blend weight of new Gaussians from which they cover a pixel
@@ -91,16 +92,16 @@ def still_open(
     new = np.zeros(len(filled), bool)
     new[-added:] = True
     side = 2 * settings.margin + 1
-    near = touched | (cv2.dilate(view.target.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+    near = touched | dilated(view.target, settings.margin)
     scene = drawing(filled, view.camera, with_colour=False, pixels=near)
     before = view.depth_after, view.alpha_after
     depth, alpha = (np.where(touched, d, b) for d, b in zip(scene.surface_depth(), before))
     covered = scene.footprint(new) > DRAWN
-    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > settings.solid)
+    coloured = (rules != Rule.UNREACHED) | (view.alpha_after > SOLID)
     target = view.target & (~covered | (rules == Rule.UNREACHED))
     farthest = cv2.dilate(np.where(covered, depth, 0).astype(np.float32), np.ones((side, side), np.uint8))
     nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
-    at_edge = nearest < (1 - settings.layer_step) * depth
-    joined = coloured & (alpha > settings.solid) & (at_edge | (depth < (1 + settings.layer_step) * farthest))
+    at_edge = nearest < (1 - LAYER_STEP) * depth
+    joined = coloured & (alpha > SOLID) & (at_edge | (depth < (1 + LAYER_STEP) * farthest))
     wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side - 1, side - 1), np.uint8)) > 0
     return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)

@@ -1,4 +1,4 @@
-"""Brings photos to the exposure of the splats, so that new Gaussians match those round the hole (METHOD section 8)."""
+"""Brings photos to the exposure of the splats, so that new Gaussians match those round the hole."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import SOLID
 from ..raster import render_bytes
 from ..solvers.colours import exposure_gain
 from .masks import ViewMasks
@@ -73,7 +74,7 @@ def exposure_ring(view: ViewMasks) -> np.ndarray:
         return silhouette
     distance = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, 5)
     reach = max(LEAST_REACH, 0.5 * float(np.sqrt(silhouette.sum())))
-    return (distance > 0) & (distance <= reach) & (view.alpha_after > 0.9) & ~view.target
+    return (distance > 0) & (distance <= reach) & (view.alpha_after > SOLID) & ~view.target
 
 
 def level_exposure(

@@ -12,6 +12,7 @@ import numpy as np
 from ..box import Region
 from ..camera import Camera
 from ..compute.threads import parallel_map
+from ..geometry import surface_points
 from .charts import (
     PARALLEL,
     ChartSettings,
@@ -26,7 +27,6 @@ from .charts import (
 )
 from .masks import ViewMasks
 from .mosaic import mosaic
-from .outline import surface_points
 from .witness import Says, Textures, Witness, ask
 
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for

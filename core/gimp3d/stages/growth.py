@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import scipy.ndimage
@@ -19,29 +19,18 @@ from scipy.spatial import cKDTree
 from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..gaussians import SH_C0, Gaussians
-from ..schema import Between, Share
-from .selection import Fate, Selection, Weights
-from .surroundings import SurroundingsSettings, follow_surroundings
+from .surroundings import follow_surface
 
-
-@dataclass(frozen=True)
-class GrowthSettings:
-    """What belongs to an object that a box cuts."""
-
-    reach: float = 0.5  # how far from a box its rest may lie, as a share of the box's longest edge
-    touch: float = (
-        4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
-    )
-    colour: Share = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
-    bins: Annotated[int, Between(1, 64)] = 12  # of each channel in the histograms of both their colours
-    likely: Share = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
-    unlikely: Share = 0.1  # probability up to which one off the surface is something else
-    share: Share = 0.1  # of a part's Gaussians that the boxes must hold
-    least: int = 10  # Gaussians of a piece that is worth proposing
-    shown: float = 0.5  # weight below which a Gaussian shows nothing
-    large: float = 0.25  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
-    surroundings: SurroundingsSettings = SurroundingsSettings(cells=200_000, views=20, beyond=0.1, seeds=0.05)
-
+REACH = 0.5  # how far from a box its rest may lie, as a share of the box's longest edge
+TOUCH = 4.0  # centres so near touch, times the median distance of an object's Gaussian from its fifth nearest
+COLOUR = 0.25  # largest difference of a channel between Gaussians that look alike, colours in [0, 1]
+BINS = 12  # of each channel in the histograms of both their colours
+LIKELY = 0.9  # probability by colour from which a Gaussian on the surface is the object's all the same
+UNLIKELY = 0.1  # probability up to which one off the surface is something else
+SHARE = 0.1  # of a part's Gaussians that the boxes must hold
+LEAST = 10  # Gaussians of a piece that is worth proposing
+LEAST_WEIGHT = 0.5  # blend weight, summed over pixels and views, up to which a Gaussian shows nothing: half a pixel
+LARGE = 0.25  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
 
 NOTHING: dict[str, Any] = {"gaussians": 0, "box": None}  # proposed
 
@@ -80,52 +69,52 @@ class Growth:
 def find_growth(
     gaussians: Gaussians,
     region: Region,  # boxes round the object
-    selection: Selection,
-    weights: Weights,  # whole as far round the boxes as `reach`, see selection.near_region
+    of_object: np.ndarray,  # [N] bool, those that go as the object's
+    stays: np.ndarray,  # [N] bool, those that are kept
+    shown: np.ndarray,  # [N] blend weight summed over pixels and views, whole as far round the boxes as REACH
     views: Sequence[tuple[Camera, np.ndarray]],  # (camera, z-depth [H, W] with the object, 0 = nothing)
-    settings: GrowthSettings = GrowthSettings(),
 ) -> Growth:
     """Which kept Gaussians are the object's, though the boxes or the surface under it kept them."""
     none = Growth(np.zeros(len(gaussians), bool), region, None)
-    outer = tuple(_enlarged(box, settings.reach * box.size.max()) for box in region)
-    fates, longest = selection.fates, gaussians.scales.max(1)
-    of_object = (fates >= Fate.REMOVED_INSIDE) & (fates != Fate.REMOVED_MASKED)
-    small = longest < settings.large * min(box.size.min() for box in region)
-    shown = weights.object_ + weights.clear
-    there = gaussians.usable & (shown > settings.shown) & in_region(outer, gaussians.means.astype(np.float64))
-    rows = np.flatnonzero(there & (of_object | (small & (fates < Fate.REMOVED_INSIDE))))
+    outer = tuple(_enlarged(box, REACH * box.size.max()) for box in region)
+    longest = gaussians.scales.max(1)
+    small = longest < LARGE * min(box.size.min() for box in region)
+    there = gaussians.usable & (shown > LEAST_WEIGHT) & in_region(outer, gaussians.means.astype(np.float64))
+    rows = np.flatnonzero(there & (of_object | (small & stays)))
     points, object_ = gaussians.means[rows].astype(np.float64), of_object[rows]
-    if object_.sum() < settings.least or object_.all():
+    if object_.sum() < LEAST or object_.all():
         return none
     on_surface = np.zeros(len(rows), bool)
     for box in outer:
-        part = follow_surroundings(box, outer, views, settings.surroundings)
+        # coarser than for the selection: a proposal needs no more
+        part = follow_surface(box, outer, views, beyond=0.1, seeds=0.05, most_cells=200_000, most_views=20)
         on_surface |= part.distance(points) <= part.cell + longest[rows]
     colours = np.clip(0.5 + SH_C0 * gaussians.sh[rows, 0], 0, 1)
-    like = _likelihood(colours, shown[rows], object_ & ~on_surface, ~object_ & on_surface, settings.bins)
-    nodes = object_ | (like > np.where(on_surface, settings.likely, settings.unlikely))
-    rows, points, object_, colours, like = (a[nodes] for a in (rows, points, object_, colours, like))
+    like = _likelihood(colours, shown[rows], object_ & ~on_surface, ~object_ & on_surface)
+    nodes = object_ | (like > np.where(on_surface, LIKELY, UNLIKELY))
+    rows, points, object_ = rows[nodes], points[nodes], object_[nodes]
+    colours, like = colours[nodes], like[nodes]
     tree = cKDTree(points[object_])
     spacing = float(np.median(tree.query(points[object_], k=min(6, tree.n))[0][:, -1]))
-    radius = settings.touch * spacing
+    radius = TOUCH * spacing
     pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
-    pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < settings.colour).all(1)]
+    pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < COLOUR).all(1)]
     parts = _components(pairs, len(rows))
     held, cut = np.bincount(parts[object_], minlength=len(rows)), np.bincount(parts[~object_], minlength=len(rows))
     known = in_region([_enlarged(box, -spacing) for box in outer], points)
     endless = np.bincount(parts[~object_ & ~known], minlength=len(rows)) > 0
-    ours = held >= np.maximum(1, settings.share * (held + cut))
+    ours = held >= np.maximum(1, SHARE * (held + cut))
     grown = np.flatnonzero((ours & ~endless)[parts] & ~object_)
     renumbered = np.full(len(rows), -1)
     renumbered[grown] = np.arange(len(grown))
     within = renumbered[pairs]
     pieces = _components(within[(within >= 0).all(1)], len(grown))
     sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
-    grown = grown[((sizes >= settings.least) & (likes > sizes / 2))[pieces]]
+    grown = grown[((sizes >= LEAST) & (likes > sizes / 2))[pieces]]
     outside = int((~in_region(region, points[grown])).sum())
     too_much = outside > object_.sum() + len(grown) - outside
     if not len(grown) or too_much:
-        return replace(none, endless=bool(too_much or (ours & endless & (cut >= settings.least)).any()))
+        return replace(none, endless=bool(too_much or (ours & endless & (cut >= LEAST)).any()))
     found = none.rows.copy()
     found[rows[grown]] = True
     holding = [_holding(box, points[grown], radius) for box in region]
@@ -138,13 +127,12 @@ def _likelihood(
     weights: np.ndarray,  # [M]
     object_: np.ndarray,  # [M] bool, what is the object's for sure
     surface: np.ndarray,  # [M] bool, what is mostly surface
-    bins: int,
 ) -> np.ndarray:
     """[M]: the probability by colour that a Gaussian is the object's, from smoothed histograms of both."""
-    index = np.minimum(colours * bins, bins - 1).astype(int) @ np.array([bins * bins, bins, 1])
+    index = np.minimum(colours * BINS, BINS - 1).astype(int) @ np.array([BINS * BINS, BINS, 1])
 
     def density(rows: np.ndarray) -> np.ndarray:
-        counts = np.bincount(index[rows], weights[rows], bins**3).reshape(bins, bins, bins)
+        counts = np.bincount(index[rows], weights[rows], BINS**3).reshape(BINS, BINS, BINS)
         return scipy.ndimage.gaussian_filter(counts / max(float(counts.sum()), 1e-9), 0.7).ravel()[index]
 
     of_object, of_surface = density(object_), density(surface)

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..compute.threads import parallel_map
 from ..gaussians import SH_C0, Gaussians
+from ..geometry import window_round
 from ..raster import PixelRegion, Window, label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
 from .charts import Hits, first_hits
 from .ground import Ground
-from .outline import window_round
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow

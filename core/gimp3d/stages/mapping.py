@@ -10,10 +10,10 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
+from ..geometry import disparity_of
 from ..schema import Share, Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ..solvers.surface import tangent_planes
-from .reference import disparity_of
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 

@@ -1,8 +1,6 @@
-"""Where things lie in a view: a box's outline, the window that holds it, and that part of the view as a camera."""
+"""A box in a view: its outline, the window that holds it, and the guard band round it (paper 3.2)."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +8,7 @@ import numpy as np
 from ..box import Box
 from ..camera import Camera
 from ..gaussians import Gaussians
-from ..raster import Window
+from ..geometry import Window, window_round
 
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
 
@@ -51,11 +49,15 @@ def fill_polygon(
     if (high <= low).any():
         return mask
     x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
-    start, end = polygon.astype(np.float64), np.roll(polygon.astype(np.float64), -1, axis=0)
-    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in zip(start, end)]
-    inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
-    mask[low[1] : high[1], low[0] : high[0]] = inside
+    mask[low[1] : high[1], low[0] : high[0]] = _inside(polygon.astype(np.float64), x, y)
     return mask
+
+
+def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Bool of x's shape: points on one side of all edges of a convex polygon [M, 2]."""
+    edges = list(zip(polygon, np.roll(polygon, -1, axis=0)))
+    sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) for a, b in edges]
+    return np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
 
 
 def guard_gaussians(
@@ -67,31 +69,11 @@ def guard_gaussians(
 ) -> np.ndarray:
     """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
     uv, _ = camera.project(gaussians.means.astype(np.float64))
-    centre = polygon.mean(0)
-
-    def inside(outline: np.ndarray) -> np.ndarray:
-        rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
-        start, end = outline, np.roll(outline, -1, axis=0)
-        u, v = uv[rows, 0, None], uv[rows, 1, None]
-        side = (end - start)[:, 0] * (v - start[:, 1]) - (end - start)[:, 1] * (u - start[:, 0])
-        result = np.zeros(len(uv), dtype=bool)
-        result[rows] = (side >= 0).all(1) | (side <= 0).all(1)
-        return result
-
-    return inside(centre + scale * (polygon - centre)) & ~inside(polygon)
-
-
-def window_round(
-    points: np.ndarray,  # [N, 2] pixels
-    camera: Camera,
-    margin: int = 0,  # pixels
-) -> Window:
-    """The rectangle round the points and a margin, within the picture; never empty."""
-    size = np.array([camera.width, camera.height])
-    ends = [points.min(0), points.max(0)] if len(points) else [size / 2, size / 2]
-    low = np.clip(np.floor(ends[0]) - margin, 0, size - 1).astype(int)
-    high = np.clip(np.ceil(ends[1]) + margin, low + 1, size).astype(int)
-    return slice(low[1], high[1]), slice(low[0], high[0])
+    rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
+    centre, (u, v) = polygon.mean(0), uv[rows].T
+    found = np.zeros(len(uv), bool)
+    found[rows] = _inside(centre + scale * (polygon - centre), u, v) & ~_inside(polygon, u, v)
+    return found
 
 
 def box_window(box: Box, camera: Camera) -> Window:
@@ -100,34 +82,3 @@ def box_window(box: Box, camera: Camera) -> Window:
     if (camera.to_camera(corners)[:, 2] <= 0).any():
         return slice(0, camera.height), slice(0, camera.width)
     return window_round(camera.project(corners)[0], camera, 1)
-
-
-def window_mask(window: Window, camera: Camera) -> np.ndarray:
-    """[H, W] bool: the pixels of a view that lie in a window."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    mask[window] = True
-    return mask
-
-
-def cropped(camera: Camera, window: Window) -> Camera:
-    """The part of a view in a window, with exact intrinsics."""
-    rows, cols = window
-    return replace(
-        camera,
-        width=cols.stop - cols.start,
-        height=rows.stop - rows.start,
-        cx=camera.cx - cols.start,
-        cy=camera.cy - rows.start,
-    )
-
-
-def surface_points(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z, 0 = nothing
-    window: Window,
-    step: int = 1,  # only every step-th row and column
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows [N], columns [N] and scene points [N, 3] of the pixels in a window that show a surface."""
-    rows, cols = np.nonzero(depth[window][::step, ::step] > 0)
-    rows, cols = step * rows + window[0].start, step * cols + window[1].start
-    return rows, cols, camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))

@@ -1,35 +1,33 @@
-"""Which view explains the hole best, and what can be seen of the hole's surface in the photos (METHOD section 2)."""
+"""Which view explains the hole best, and is completed first (docs/method.md)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
-from ..schema import AtLeastOne, Many, Share
+from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
+from ..schema import Many
 from ..solvers.thin_plate import ThinPlateSettings
 from .depth import DepthSettings, complete_disparity
-from .masks import ViewMasks, sees
+from .masks import ViewMasks
 
-PROVISIONAL = DepthSettings(
-    plate=ThinPlateSettings(unknowns=1000), small_part=300
-)  # where the hidden surface is, about
+SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
+MOST_EXTRA = 8  # further references that a plan looks ahead
+# Where the hidden surface is, about: coarse and fast.
+PROVISIONAL = DepthSettings(plate=ThinPlateSettings(unknowns=1000), small_part=300)
 
 
 @dataclass(frozen=True)
 class ReferenceSettings:
-    """How the hidden surface is sampled and what a view of it is worth. Lengths in pixels."""
+    """How the choice of a reference is made."""
 
-    minimum_pixels: int = 1  # a view with fewer hole pixels cannot be the reference
-    surface_views: AtLeastOne = 12  # views, evenly chosen, that say where the hidden surface may be
-    samples: Many = 2000  # of the surface from each of them, about
-    most_extra: int = 8  # further references that a plan looks ahead
+    samples: Many = 2000  # points; of the hidden surface from each view, about: a steadier choice for more time
 
 
 @dataclass(frozen=True)
@@ -54,52 +52,8 @@ class ReferenceChoice:
     reason: str
 
 
-def surface_normals(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z-depth, 0 = nothing
-) -> np.ndarray:
-    """Unit normals [H, W, 3] of a depth map in camera axes, facing the camera; 0 where depth is missing."""
-    points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)) @ camera.R.T
-    right, down = _difference(points, 1), _difference(points, 0)
-    normals = np.cross(down, right)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    valid = (depth > 0)[..., None] & (length > 0)
-    return np.where(valid, normals / np.where(length > 0, length, 1), 0.0)
-
-
-def _difference(points: np.ndarray, axis: int) -> np.ndarray:
-    """One-sided differences of [H, W, 3] points, to the side where depth changes less: edges do not tilt normals."""
-    if points.shape[axis] < 2:
-        return np.zeros_like(points)
-    step = np.diff(points, axis=axis)
-    first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
-    forward, backward = np.concatenate([step, last], axis), np.concatenate([first, step], axis)
-    return np.where(np.abs(forward[..., 2:]) <= np.abs(backward[..., 2:]), forward, backward)
-
-
-def facing(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W]
-) -> np.ndarray:
-    """cos θ between each surface element and its viewing ray, [H, W] in [0, 1]."""
-    rays = np.concatenate(
-        [
-            (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy],
-            np.ones(depth.shape)[..., None],
-        ],
-        -1,
-    )
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    return np.clip(-(surface_normals(camera, depth) * rays).sum(-1), 0.0, 1.0)
-
-
-def disparity_of(depth: np.ndarray) -> np.ndarray:
-    """1/z [H, W] float32, 0 where there is nothing (METHOD section 0)."""
-    return np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
-
-
-def rim(view: ViewMasks, solid: float) -> np.ndarray:
-    """[H, W] bool: pixels whose depth after the removal is trusted (METHOD section 3, boundary)."""
+def rim(view: ViewMasks, solid: float = SOLID) -> np.ndarray:
+    """[H, W] bool: pixels whose depth after the removal is trusted."""
     return ~view.target & (view.alpha_after > solid) & (view.depth_after > 0)
 
 
@@ -112,11 +66,11 @@ class NeededSurface:
 
 
 def needed_surface(
-    views: Sequence[ViewMasks], solid: float = 0.9, settings: ReferenceSettings = ReferenceSettings()
+    views: Sequence[ViewMasks], solid: float = SOLID, settings: ReferenceSettings = ReferenceSettings()
 ) -> NeededSurface:
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
-    seeing = [v for v in views if v.target.sum() >= settings.minimum_pixels]
-    step = max(1, -(-len(seeing) // settings.surface_views))
+    seeing = [v for v in views if v.target.any()]
+    step = max(1, -(-len(seeing) // SURFACE_VIEWS))
     parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
@@ -150,8 +104,7 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
     A surface that is only sampled need not be completed at every pixel.
     """
     margin = step * (PROVISIONAL.planes.ring + 2)
-    ends = ((x[0], x[-1]) for x in (np.flatnonzero(view.target.any(1 - axis)) for axis in (0, 1)))
-    rows, cols = (slice(max(0, int(first) - margin), int(last) + margin + 1, step) for first, last in ends)
+    rows, cols = (slice(s.start, s.stop, step) for s in bounds(view.target, margin))
     height, width = view.target[rows, cols].shape
     c = view.camera
     cx, cy = (c.cx - cols.start - 0.5) / step + 0.5, (c.cy - rows.start - 0.5) / step + 0.5
@@ -162,13 +115,13 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
-    solid: float = 0.9,
+    solid: float = SOLID,
     settings: ReferenceSettings = ReferenceSettings(),
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
-    Score: Σ over the needed surface of visible × cos θ × pixels per area (METHOD section 2), each sample relative to
+    Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
     the best view of it: 1 is a view that shows everything as well as any does. The plan goes on greedily with the
     views that cover most of what the ones before do not.
 
@@ -180,7 +133,7 @@ def choose_reference(
     surface = needed_surface(views, solid, settings)
 
     def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
-        return _seen(view, surface) if view.target.sum() >= settings.minimum_pixels else None
+        return _seen(view, surface) if view.target.any() else None
 
     seen = parallel_map(shown_in, views, most=2)
     untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
@@ -200,7 +153,7 @@ def choose_reference(
     if wanted is not None and wanted not in {s.camera_id for s in scores}:
         raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
     chosen = next(s for s in scores if wanted in (None, s.camera_id))
-    plan = _plan({v.camera.id: cosine > 0 for v, cosine, _ in candidates}, scores, chosen.camera_id, settings)
+    plan = _plan({v.camera.id: cosine > 0 for v, cosine, _ in candidates}, scores, chosen.camera_id)
     how = "as asked" if wanted else "explains most of the hidden surface"
     reason = (
         f"{chosen.camera_id}: {how}: shows {chosen.covered:.0%} of it, facing it by cos {chosen.facing:.2f}, with "
@@ -214,25 +167,21 @@ def choose_reference(
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
     """cos θ and pixels per area [S] of each sample in a view's hole; both 0 where it does not show it."""
     camera = view.camera
-    uv, z = camera.project(surface.points)
-    with np.errstate(invalid="ignore"):
-        framed = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    cols, rows = np.where(framed[:, None], uv, 0).astype(int).T
-    cosine = -(surface.normals * _directions(surface.points, camera)).sum(-1)
-    shown = framed & view.target[rows, cols] & (cosine > 0)
-    density = cosine * camera.fx * camera.fy / np.where(shown, z, 1) ** 2
-    return np.where(shown, cosine, 0.0), np.where(shown, density, 0.0)
+    index, rows, cols, z = framed(camera, surface.points)
+    cosine = -(surface.normals * directions(surface.points, camera)).sum(-1)
+    shown = view.target[rows, cols] & (cosine[index] > 0)
+    index, z = index[shown], z[shown]
+    found = np.zeros((2, len(cosine)))
+    found[:, index] = cosine[index], cosine[index] * camera.fx * camera.fy / z**2
+    return found[0], found[1]
 
 
 def _has_rim(view: ViewMasks, solid: float) -> bool:
     """Whether anything known bounds the hole."""
-    grown = cv2.dilate(view.target.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return bool((grown & rim(view, solid)).any())
+    return bool((dilated(view.target, 1) & rim(view, solid)).any())
 
 
-def _plan(
-    shown: dict[str, np.ndarray], scores: Sequence[ViewScore], first: str, settings: ReferenceSettings
-) -> tuple[tuple[str, float], ...]:
+def _plan(shown: dict[str, np.ndarray], scores: Sequence[ViewScore], first: str) -> tuple[tuple[str, float], ...]:
     """The views that cover most, one after the other (greedy maximum coverage, Nemhauser 1978)."""
     order = {s.camera_id: k for k, s in enumerate(scores)}
     open_, name, plan = np.ones(len(shown[first]), bool), first, []
@@ -240,71 +189,5 @@ def _plan(
         open_ &= ~shown[name]
         plan.append((name, float(1 - open_.mean())))
         name = max(order, key=lambda n: ((shown[n] & open_).sum(), -order[n]))
-        if not (shown[name] & open_).any() or len(plan) > settings.most_extra:
+        if not (shown[name] & open_).any() or len(plan) > MOST_EXTRA:
             return tuple(plan)
-
-
-@dataclass(frozen=True)
-class EvidenceSettings:
-    """When a photo counts as a true picture of the surface behind the object. Depths relative, lengths in pixels."""
-
-    tolerance: Share = 0.006  # how near a view's first surface must be to the completed one
-    margin: int = 3  # px round the sample that must not hold something nearer
-    contact: int = 4  # px that evidence keeps away from what no photo shows: where the object touches the surface
-    nearer: Share = 0.03  # how much nearer counts as an occluder
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What photos show of the reference's hole."""
-
-    image: np.ndarray  # [H, W, 3] uint8, meaningful where `seen`
-    seen: np.ndarray  # [H, W] bool
-
-
-def gather_evidence(
-    camera: Camera,  # the reference
-    depth: np.ndarray,  # [H, W] its completed z-depth
-    target: np.ndarray,  # [H, W] bool, T_0
-    views: Iterable[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
-    settings: EvidenceSettings = EvidenceSettings(),
-) -> Evidence:
-    """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.
-
-    What some view saw is copied from that view, never invented (METHOD section 1, `ours`).
-    """
-    rows, cols = np.nonzero(target & (depth > 0))
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
-    rays = _directions(points, camera)
-    best = np.full(len(points), -1.0)
-    colours = np.zeros((len(points), 3), np.uint8)
-    for other, photo, seen_depth in views:
-        cosine = (rays * _directions(points, other)).sum(-1)
-        open_points = np.flatnonzero(cosine > best)
-        clear = sees(other, _without_occluders(seen_depth, settings), points[open_points], settings.tolerance)
-        found = open_points[clear]
-        if len(found):
-            uv, _ = other.project(points[found])
-            x, y = (uv.astype(np.float32) - 0.5).T[:, :, None]
-            colours[found] = cv2.remap(photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        best[found] = cosine[found]
-    image = np.zeros((*target.shape, 3), np.uint8)
-    image[rows, cols] = colours
-    seen = np.zeros(target.shape, bool)
-    seen[rows, cols] = best > -1
-    unseen = (target & ~seen).astype(np.uint8)
-    seen &= cv2.dilate(unseen, np.ones((2 * settings.contact + 1,) * 2, np.uint8)) == 0
-    return Evidence(image, seen)
-
-
-def _directions(points: np.ndarray, camera: Camera) -> np.ndarray:
-    towards = points - camera.centre
-    return towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-12)
-
-
-def _without_occluders(depth: np.ndarray, settings: EvidenceSettings) -> np.ndarray:
-    """The depth map with the surroundings of depth edges taken out (0): photos mix colours there."""
-    size = 2 * settings.margin + 1
-    filled = np.where(depth > 0, depth, np.inf).astype(np.float32)
-    nearest = cv2.erode(filled, np.ones((size, size), np.uint8))
-    return np.where(nearest < (1 - settings.nearer) * depth, 0, depth).astype(np.float32)

@@ -14,14 +14,12 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, quats_to_matrices
+from ..geometry import cropped, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import AtLeastOne, Between, Positive, Share
 from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
-from .masks import sees
-from .outline import cropped, window_mask
 from .propagate import PaintedView, Rule
-from .reference import surface_normals
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
 SHOWN = 0.5  # px of blend weight by which a view shows a Gaussian at all
@@ -49,7 +47,7 @@ class SeedSettings:
     sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new Gaussians; each gets what its observations support
     # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
     # they share against the reference is mostly a shadow or an exposure that it has not.
-    harmonics: HarmonicsSettings = HarmonicsSettings(floor=20.0, offset=True)
+    harmonics: HarmonicsSettings = HarmonicsSettings(offset=True)
     grey: float = 0.5  # what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
     depth_tolerance: Share = 0.02  # z-test of observations
 

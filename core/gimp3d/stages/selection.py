@@ -1,11 +1,11 @@
-"""Which Gaussians go: the object in the user's boxes, not the floor that they cut into (METHOD section 1)."""
+"""Which Gaussians go: the object in the user's boxes, not the floor that they cut into (docs/method.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -15,12 +15,23 @@ from ..box import Region, in_region
 from ..camera import Camera
 from ..compute.threads import parallel_map, run_ranges
 from ..gaussians import Gaussians, quats_to_matrices
+from ..geometry import dilated, surface_points
 from ..raster import label_weights
 from ..schema import Share
-from .outline import box_window, surface_points
-from .surroundings import Surroundings, SurroundingsSettings
+from .growth import LEAST_WEIGHT, Growth, find_growth
+from .look import ViewBefore
+from .outline import box_window
+from .surroundings import THICKNESS, FollowedSurface, follow_surface
 
 R = TypeVar("R")
+STRADDLE = 0.02  # share of a Gaussian's mass in the region from which it reaches in
+MOSTLY = 0.5  # share of its mass, or of its weight, that decides: the majority
+LARGE = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
+SLACK = 1.0  # how far outside the boxes surface may still be the object's, cells of the followed surface
+RIM = 2.0  # width of the ring round the object where its colours may have run, cells of the followed surface
+LEAST_OBJECT = 0.002  # share of the region's outline that an object fills in some view to stand in a box
+LEAST_CELLS = 4.0  # of the followed surface along a box; in coarser ones a Gaussian's centre decides
+NEAR = 0.5  # how far from a box what only the removal reveals is looked for, as a share of the box's longest edge
 BATCH = 32  # views whose weights are held at once
 PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
 
@@ -41,22 +52,10 @@ class Fate(IntEnum):
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """What counts as the object. Weights are blend weights, summed over pixels and views."""
+    """What counts as the object."""
 
-    by_centre: bool = False  # the paper's rule: nothing but centres in the region counts
-    straddle: Share = 0.02  # share of a Gaussian's mass in the region from which it reaches in
-    mostly: Share = 0.5  # share of its mass, or of its weight, that decides
-    slack: float = 1.0  # how far outside the boxes surface may still be the object's, cells of the surroundings
-    rim: float = 2.0  # width of the ring round the object where its colours may have run, cells of the surroundings
-    large: float = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
-    shown: float = 0.5  # weight below which a Gaussian shows nothing
-    support: Share = 0.05  # of what the removal reveals of a Gaussian, photos must have shown so much; 0 keeps all
-    least_object: Share = 0.002  # share of the region's outline that an object fills in some view to stand in a box
-    least_cells: float = 4.0  # of the surroundings along a box; in coarser ones its centre decides of a Gaussian
-    near: float = 0.5  # how far from a box such Gaussians are looked for, as a share of its longest edge
-    misfit: float = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
-    least_misfit: Share = 0.1  # … and by so much, colours in [0, 1]
-    surroundings: SurroundingsSettings = SurroundingsSettings()
+    by_centre: bool = False  # yes or no; the paper's rule, nothing but centres in the boxes, against what views show
+    support: Share = 0.05  # share; photos must have shown so much of what the removal reveals: smears go, floor may too
 
 
 @dataclass(frozen=True)
@@ -141,12 +140,65 @@ def by_centre(
     return Selection(np.where(inside, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
 
 
+def choose(
+    gaussians: Gaussians,
+    region: Region,
+    before: Sequence[ViewBefore],
+    support: float,  # see SelectionSettings
+    grow: bool,  # what of the object the boxes cut off goes too
+    over: Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]] = parallel_map,
+) -> tuple[Selection, list[ViewBefore], Growth | None]:
+    """Which Gaussians go, by what views show of them; the views, what else the user named masked out; what was cut off.
+
+    Where nothing stands out of the surface in a box, the surface itself is meant: a shadow, a picture on the floor.
+    """
+    depths = [(b.camera, b.depth) for b in before]
+    surroundings = [follow_surface(box, region, depths) for box in region]
+    centre = by_centre(select_removed(gaussians, region))
+    if all(box.size.max() < LEAST_CELLS * s.cell for box, s in zip(region, surroundings)):
+        return centre, list(before), None  # pictures this small show no surface to follow
+    seen = over(lambda b: object_and_rim(b.camera, b.depth, region, surroundings), before)
+    members = [boxes_of(b.camera, np.where(o, b.depth, 0), region, surroundings) for b, (o, _) in zip(before, seen)]
+    stands = standing(members, [int(b.polygon.sum()) for b in before])
+    objects = tuple(box for box, s in zip(region, stands) if s)
+    named = tuple(box for box, s in zip(region, stands) if not s)
+
+    def with_named(view: ViewBefore) -> ViewBefore:
+        mask = surface_in(view.camera, view.depth, named) & ~surface_in(view.camera, view.depth, objects)
+        return replace(view, extra=mask if view.extra is None else mask | view.extra)
+
+    views = parallel_map(with_named, before) if named else list(before)
+    if not objects:
+        return centre, views, None
+    sightings = parallel_map(lambda pair: _sighting(pair[0], *pair[1]), list(zip(views, seen)))
+    near = near_region(gaussians, objects)
+    weights = weigh(gaussians, near, sightings)
+    selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o])
+    if support > 0:
+        revealed = weigh_revealed(gaussians, selection, near, sightings)
+        selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, support)
+    of_object = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
+    growth = find_growth(gaussians, objects, of_object, ~selection.removed, weights.object_ + weights.clear, depths)
+    fates = np.where(growth.rows & grow, np.uint8(Fate.REMOVED_GROWN), selection.fates)
+    alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
+    growth = replace(growth, region=growth.region + named, taken=grow and growth.box is not None)
+    return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), fates)), views, growth
+
+
+def _sighting(view: ViewBefore, object_: np.ndarray, ring: np.ndarray) -> Sighting:
+    shows = np.full(object_.shape, Shows.CLEAR, np.uint8)
+    shows[ring | view.misfit] = Shows.NOTHING
+    shows[object_] = Shows.OBJECT
+    if view.extra is not None:
+        shows[view.extra] = Shows.MASKED
+    return Sighting(view.camera, shows, view.extra is not None)
+
+
 def object_and_rim(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z with the object, 0 = nothing
     region: Region,
-    surroundings: Sequence[Surroundings],
-    settings: SelectionSettings = SelectionSettings(),
+    surroundings: Sequence[FollowedSurface],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels whose first surface lies in the region and is not the surroundings', and the ring round them.
 
@@ -155,38 +207,35 @@ def object_and_rim(
     found = np.zeros(depth.shape, np.uint8)
     cell = max(part.cell for part in surroundings)
     for box in region:
-        grown = replace(box, size=box.size + 2 * settings.slack * cell)
+        grown = replace(box, size=box.size + 2 * SLACK * cell)
         rows, cols, points = surface_points(camera, depth, box_window(grown, camera))
         inside = np.flatnonzero(grown.contains(points))
         for part in surroundings:
-            inside = inside[part.distance(points[inside]) > settings.surroundings.thickness * part.cell]
+            inside = inside[part.distance(points[inside]) > THICKNESS * part.cell]
         found[rows[inside], cols[inside]] = 1
-    found = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if not found.any():
-        return found > 0, found > 0
-    distance = float(np.median(depth[found > 0]))
-    width = max(1, round(camera.fx * settings.rim * cell / distance))
-    grown = cv2.dilate(found, np.ones((2 * width + 1,) * 2, np.uint8))
-    return found > 0, grown > found
+    object_ = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    if not object_.any():
+        return object_, object_
+    width = max(1, round(camera.fx * RIM * cell / float(np.median(depth[object_]))))
+    return object_, dilated(object_, width) & ~object_
 
 
 def boxes_of(
     camera: Camera,
     depth: np.ndarray,  # [H, W] z of the object alone
     region: Region,
-    surroundings: Sequence[Surroundings],
-    settings: SelectionSettings = SelectionSettings(),
+    surroundings: Sequence[FollowedSurface],
 ) -> np.ndarray:
     """[M, B] bool: the boxes in which each of the object's pixels lies, or just outside."""
-    _, _, points = surface_points(camera, depth, (slice(0, camera.height), slice(0, camera.width)))
-    slack = 2 * settings.slack * max(part.cell for part in surroundings)
+    _, _, points = surface_points(camera, depth)
+    slack = 2 * SLACK * max(part.cell for part in surroundings)
     return np.stack([replace(b, size=b.size + slack).contains(points) for b in region], axis=1)
 
 
 def standing(
     members: Sequence[np.ndarray],  # [M, B] bool of each view, see boxes_of
     outlines: Sequence[int],  # pixels of the region in each view
-    least: float,  # share of them
+    least: float = LEAST_OBJECT,  # share of them
 ) -> list[bool]:
     """Which boxes something stands in: greedily those that hold most of it, as long as they add enough in some view.
 
@@ -217,9 +266,13 @@ def surface_in(
     return found
 
 
-def near_region(gaussians: Gaussians, region: Region, settings: SelectionSettings = SelectionSettings()) -> np.ndarray:
+def near_region(
+    gaussians: Gaussians,
+    region: Region,
+    near: float = NEAR,  # see _surrounds
+) -> np.ndarray:
     """[N] bool: rows of whose fate something but extra masks can decide."""
-    return _reaches(gaussians, region) | _surrounds(gaussians, region, settings)
+    return _reaches(gaussians, region) | _surrounds(gaussians, region, near)
 
 
 def weigh(
@@ -254,8 +307,7 @@ def select(
     gaussians: Gaussians,
     region: Region,
     weights: Weights,
-    surroundings: Sequence[Surroundings],
-    settings: SelectionSettings = SelectionSettings(),
+    surroundings: Sequence[FollowedSurface],
 ) -> Selection:
     """Every Gaussian's fate from where it lies and where it shows.
 
@@ -265,26 +317,26 @@ def select(
     """
     shown = weights.object_ + weights.clear
     on_object = weights.object_ / np.maximum(shown, 1e-9)
-    visible = shown > settings.shown
+    visible = shown > LEAST_WEIGHT
     centre = select_removed(gaussians, region)
     usable = gaussians.usable
     rows = np.flatnonzero(_reaches(gaussians, region) & usable)
     mass = np.zeros(len(gaussians))
     mass[rows] = mass_inside(gaussians, rows, region)
     fates = np.zeros(len(gaussians), np.uint8)
-    straddling = ~centre & (mass >= settings.straddle)
+    straddling = ~centre & (mass >= STRADDLE)
     fates[straddling] = Fate.KEPT_STRADDLING
-    fates[straddling & visible & (on_object > settings.mostly)] = Fate.REMOVED_STRADDLING
+    fates[straddling & visible & (on_object > MOSTLY)] = Fate.REMOVED_STRADDLING
     fates[centre] = Fate.REMOVED_INSIDE
-    elsewhere = centre & (mass < settings.mostly) & visible & (on_object <= settings.mostly)
-    large = gaussians.scales.max(1) > settings.large * min(box.size.min() for box in region)
+    elsewhere = centre & (mass < MOSTLY) & visible & (on_object <= MOSTLY)
+    large = gaussians.scales.max(1) > LARGE * min(box.size.min() for box in region)
     fates[elsewhere] = np.where(large[elsewhere], Fate.KEPT_LARGE, Fate.KEPT_STRADDLING)
     inside = np.flatnonzero(fates == Fate.REMOVED_INSIDE)
-    clean = visible[inside] & (on_object[inside] <= settings.mostly)
+    clean = visible[inside] & (on_object[inside] <= MOSTLY)
     for part in surroundings:
         surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
         fates[inside[surface & clean]] = Fate.KEPT_SURFACE
-    under_masks = weights.masked > np.maximum(settings.shown, settings.mostly * (weights.masked + weights.unmasked))
+    under_masks = weights.masked > np.maximum(LEAST_WEIGHT, MOSTLY * (weights.masked + weights.unmasked))
     fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
 
@@ -318,23 +370,23 @@ def without_revealed(
     region: Region,
     clear: np.ndarray,  # [N] weight on what views showed unhidden, with the object in place
     revealed: np.ndarray,  # [N], see weigh_revealed
-    settings: SelectionSettings = SelectionSettings(),
+    support: float,  # see SelectionSettings
 ) -> Selection:
-    """Remove what the removal reveals near the region and no photo vouches for (METHOD section 1, contamination).
+    """Remove what the removal reveals near the region and no photo vouches for (docs/method.md).
 
     Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them.
     """
-    near = _surrounds(gaussians, region, settings)
-    found = near & ~selection.removed & (revealed > settings.shown) & (clear < settings.support * revealed)
+    near = _surrounds(gaussians, region)
+    found = near & ~selection.removed & (revealed > LEAST_WEIGHT) & (clear < support * revealed)
     return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
 
 
-def _surrounds(gaussians: Gaussians, region: Region, settings: SelectionSettings) -> np.ndarray:
+def _surrounds(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.ndarray:
     """[N] bool: the centre lies in a box or so near that a smear of the object may reach it."""
     found = np.zeros(len(gaussians), bool)
     for box in region:
         local = (gaussians.means - box.center) @ box.axes
-        found |= (np.abs(local) < box.size / 2 + settings.near * box.size.max()).all(1)
+        found |= (np.abs(local) < box.size / 2 + near * box.size.max()).all(1)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Floor and walls inside a user's box: surface that runs on smoothly from outside it (METHOD section 1).
+"""Floor and walls inside a user's box: surface that runs on smoothly from outside it (docs/method.md).
 
 The views' depth maps are gathered as points in small cells round the box. Growth starts where the surface leaves the
 cells, well outside the box, and goes on to a neighbouring cell if that lies in the plane of what was reached before it.
@@ -18,33 +18,28 @@ from ..box import Box, Region, in_region
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
-from ..schema import AtLeastOne, Degrees, Many, Positive, Share
-from .outline import box_window, surface_points
+from ..geometry import surface_points
+from .outline import box_window
 
+CELLS = 800_000  # of the grid round one box at most: more take seconds and hold too few points each
+VIEWS = 60  # at most so many, spread evenly, are gathered: further ones show the same surface
+BEYOND = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
+SEEDS = 0.1  # width of the grid's outer layer, where growth starts, as such a share
+LEAST_CELL = 1.5  # edge of a cell, pixels of a usual view: narrower ones stay empty between pixels
+LEAST_POINTS = 3  # in a cell that counts as surface: as many as span a plane
+# Of a cell against the plane of those reached before it; test_surroundings holds them against shapes that are known.
+STEP = 0.6  # cells off it at most
+TURN = math.cos(math.radians(50))  # least cosine between both normals
+STEADY = math.cos(math.radians(20))  # from this cosine on its own normal bends the plane that it hands on …
+ADAPT = 0.25  # … with this weight
+SUPPORT = 4  # cells within two that must have been reached before
+THICKNESS = 0.5  # cells off its plane up to which a point belongs to the surface
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix
 
 
 @dataclass(frozen=True)
-class SurroundingsSettings:
-    """How surface is followed into a box. Lengths in cells unless said otherwise."""
-
-    cells: Many = 800_000  # of the grid round one box at most
-    least_cell: Positive = 1.5  # edge of a cell, pixels of a usual view
-    least_points: AtLeastOne = 3  # in a cell that counts as surface
-    beyond: float = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
-    seeds: Share = 0.1  # width of the grid's outer layer, where growth starts, as such a share
-    views: AtLeastOne = 60  # at most so many, spread evenly, are gathered
-    step: float = 0.6  # how far a cell may lie off the plane of those reached before it
-    turn: Degrees = 50.0  # degrees that its normal may differ from theirs
-    steady: Degrees = 20.0  # degrees up to which a cell's own normal bends the plane that it hands on …
-    adapt: Share = 0.25  # … and with what weight
-    support: int = 4  # cells within two that must have been reached before
-    thickness: float = 0.5  # how far off its plane a point still belongs to the surface
-
-
-@dataclass(frozen=True)
-class Surroundings:
+class FollowedSurface:
     """The surface that was followed into a box; all in the box's axes, from its centre."""
 
     box: Box
@@ -71,20 +66,23 @@ class Surroundings:
         return distance
 
 
-def follow_surroundings(
+def follow_surface(
     box: Box,
     region: Region,  # where growth cannot start
     views: Sequence[tuple[Camera, np.ndarray]],  # (camera, z-depth [H, W] with the object, 0 = nothing)
-    settings: SurroundingsSettings = SurroundingsSettings(),
-) -> Surroundings:
+    beyond: float = BEYOND,
+    seeds: float = SEEDS,
+    most_cells: int = CELLS,
+    most_views: int = VIEWS,
+) -> FollowedSurface:
     """Follow the surface round a box into it."""
-    half = box.size * (0.5 + settings.beyond)
+    half = box.size * (0.5 + beyond)
     pixel = float(np.median([abs(c.to_camera(box.center)[2]) / c.fx for c, _ in views]))
     points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
-    least = pixel * max(settings.least_cell, math.sqrt(settings.least_points / points_per_cell))
-    cell = max(least, float((8 * half.prod() / settings.cells) ** (1 / 3)))
+    least = pixel * max(LEAST_CELL, math.sqrt(LEAST_POINTS / points_per_cell))
+    cell = max(least, float((8 * half.prod() / most_cells) ** (1 / 3)))
     dims = tuple(int(n) for n in np.ceil(2 * half / cell))
-    count = min(len(views), settings.views)
+    count = min(len(views), most_views)
     used = [views[k * len(views) // count] for k in range(count)]
     found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
     local = np.concatenate(found)
@@ -94,24 +92,22 @@ def follow_surroundings(
     x, rows = local.T, numbers[keys]
     values = [None, *x, *(x[a] * x[b] for a, b in PAIRS)]
     moments = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in values], axis=1)
-    enough = moments[:, 0] >= settings.least_points
+    enough = moments[:, 0] >= LEAST_POINTS
     cells = np.stack(np.unravel_index(np.flatnonzero(filled)[enough], dims), axis=1)
     points = moments[enough, 1:4] / moments[enough, :1]
     normals = _normals(moments, numbers.reshape(dims), cells)
     there = tuple(cells.T)
     numbers = np.full(dims, -1, np.int32)
     numbers[there] = np.arange(len(points))
-    edge = (np.abs(points) > half - settings.seeds * box.size).any(1)
+    edge = (np.abs(points) > half - seeds * box.size).any(1)
     reached = edge & ~in_region(region, box.center + points @ box.axes.T)
-    turn, steady = math.cos(math.radians(settings.turn)), math.cos(math.radians(settings.steady))
-    limits = np.array([settings.step * cell, turn, steady, settings.adapt, settings.support])
     planes = np.concatenate([points, normals], axis=1)
-    _grow(numbers, cells, points, normals, limits, reached, planes)
+    _grow(numbers, cells, points, normals, STEP * cell, reached, planes)
     nearest = np.full(dims, -1, np.int32)
     nearest[there] = np.where(reached, np.cumsum(reached) - 1, -1)
     far, (i, j, k) = scipy.ndimage.distance_transform_edt(nearest < 0, return_indices=True)
     nearest = np.where(far <= 2, nearest[i, j, k], -1).astype(np.int32)
-    return Surroundings(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
+    return FollowedSurface(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
 
 
 def _points_in(box: Box, half: np.ndarray, cell: float, camera: Camera, depth: np.ndarray) -> np.ndarray:
@@ -165,13 +161,12 @@ def _add_neighbours(cells, numbers, moments, total):
 
 
 @exact_kernel
-def _grow(numbers, cells, points, normals, limits, reached, planes):
+def _grow(numbers, cells, points, normals, step, reached, planes):
     """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated.
 
     A cell hands on the plane that it was reached by, hardly bent by its own normal: at the foot of an object cells
     hold both surfaces, and their normals would lead growth up its side.
     """
-    step, turn, steady, adapt, support = limits[0], limits[1], limits[2], limits[3], limits[4]
     touched = np.zeros(len(cells), np.bool_)
     front = np.flatnonzero(reached)
     while len(front):
@@ -200,16 +195,16 @@ def _grow(numbers, cells, points, normals, limits, reached, planes):
                         px, py, pz = px + p[0], py + p[1], pz + p[2]
                         nx, ny, nz = nx + sign * n[0], ny + sign * n[1], nz + sign * n[2]
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
-            if count < support or length == 0:
+            if count < SUPPORT or length == 0:
                 continue
             nx, ny, nz = nx / length, ny / length, nz / length
             px, py, pz = px / count, py / count, pz / count
             p, n = points[row], normals[row]
             off = nx * (p[0] - px) + ny * (p[1] - py) + nz * (p[2] - pz)
             agreement = nx * n[0] + ny * n[1] + nz * n[2]
-            if abs(off) < step and abs(agreement) > turn:
+            if abs(off) < step and abs(agreement) > TURN:
                 accepted[w] = True
-                gain = math.copysign(adapt, agreement) if abs(agreement) > steady else 0.0
+                gain = math.copysign(ADAPT, agreement) if abs(agreement) > STEADY else 0.0
                 nx, ny, nz = nx + gain * n[0], ny + gain * n[1], nz + gain * n[2]
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
                 planes[row, 3], planes[row, 4], planes[row, 5] = nx / length, ny / length, nz / length

@@ -18,14 +18,17 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
+from ..geometry import SAME_DEPTH, colours_at, framed, sees
 from ..raster import drawing, render
 from ..solvers.variogram import at_lag, foretell, variogram
 from .charts import Chart, Hits
-from .masks import ViewMasks, sees
+from .masks import ViewMasks
 from .propagate import Reference
 from .witness import Says, Witness, ask
 
-SAME = 0.02  # relative z within which two views show one surface
+VIEWS = 8  # that are looked at, spread evenly
+POINTS = 24_000  # pixels of the object in these views
+RING = 24  # px round the object
 EDGE = 3  # px next to the object that are mixed
 SCATTER = 4.0  # median distances of the drawn surface from a chart, from which something is before the chart
 UNLIKE = 24.0  # grey levels from which the object differs from what is behind it
@@ -37,17 +40,8 @@ FINE = 2.0  # px, σ of the blur that leaves no detail
 
 
 @dataclass(frozen=True)
-class VerdictSettings:
-    """How closely it is looked at."""
-
-    views: int = 8
-    points: int = 24_000  # pixels of the object in these views
-    ring: int = 24  # px round the object
-
-
-@dataclass(frozen=True)
 class Verdict:
-    """What the removal is worth (CONTRACT: verdict). None: there is nothing that tells."""
+    """What the removal is worth (docs/method.md, the verdict). None: there is nothing that tells."""
 
     score: float  # 0 bad … 1 good
     open_share: float  # of the hole's pixels
@@ -109,7 +103,6 @@ def judge(
     charts: Sequence[Chart] = (),
     hits: Mapping[str, Hits] | None = None,  # by ID
     given: Reference | None = None,  # that a picture was given for
-    settings: VerdictSettings = VerdictSettings(),
 ) -> Verdict | None:
     """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
     kept = scene.take(keep)
@@ -120,12 +113,12 @@ def judge(
     showing = [v for v in asked if v.silhouette.any()]
     if not showing:
         return None
-    count = min(settings.views, len(showing))
+    count = min(VIEWS, len(showing))
 
     def look(view: ViewMasks) -> _Look:
         photo = photos[view.camera.id].astype(np.float32)
         away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
-        near, around = away <= settings.ring, away > EDGE
+        near, around = away <= RING, away > EDGE
         beside = around & (away <= _reach(away[around], int(view.silhouette.sum())))
         before = _drawn(scene, view.camera, (near & around) | beside)
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
@@ -151,8 +144,8 @@ def judge(
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
     total = sum(int(look.view.silhouette.sum()) for look in looks)
-    step = max(1, round(math.sqrt(total / settings.points)))
-    tolerance = max([c.tolerance for c in charts], default=SAME)
+    step = max(1, round(math.sqrt(total / POINTS)))
+    tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
     samples = parallel_map(lambda x: _sampled(x, step, witnesses, tolerance, given), looks)
     return _summed(looks, samples, still_open, views, bool(photographed), bool(charts))
 
@@ -221,7 +214,7 @@ def _alike(looks: Sequence[_Look], samples: Sequence[_Sample]) -> np.ndarray:
     found = []
     for k, sample in enumerate(samples):
         found.append(_squared(sample.after, sample.expected)[sample.object & sample.told] <= limit)
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME)
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME_DEPTH)
         found.append((_squared(sample.after[sample.unseen], colours) <= limit)[seen])
     return np.concatenate(found)
 
@@ -265,7 +258,7 @@ def _sharpness(looks: Sequence[_Look]) -> float | None:
         grey = cv2.cvtColor(look.after, cv2.COLOR_RGB2GRAY)
         detail = np.abs(grey - cv2.GaussianBlur(grey, (0, 0), FINE))
         inner = cv2.erode(look.view.target.astype(np.uint8), np.ones((2 * EDGE - 1,) * 2, np.uint8)) > 0
-        on_chart = (look.chart == 0) | (np.abs(look.depth - look.chart) < SAME * look.chart)
+        on_chart = (look.chart == 0) | (np.abs(look.depth - look.chart) < SAME_DEPTH * look.chart)
         filled.append(detail[inner])
         beside.append(detail[look.ring & on_chart & (look.depth > 0)])
     if not any(map(np.size, filled)) or not any(map(np.size, beside)):
@@ -285,20 +278,22 @@ def _sampled(
     centres = camera.pixel_centres()[thin]
     # charts are what was behind the object, unless photos show what is drawn before them
     standing = object_ & (depth > 0) & (depth < (1 - tolerance) * chart)
-    standing[standing] = shown(others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME)[1]
+    standing[standing] = shown(
+        others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME_DEPTH
+    )[1]
     off_chart = (chart == 0) | standing | (ring & (np.abs(depth - chart) > tolerance * chart))
     surface = np.where(off_chart, depth, chart)
     points = camera.unproject(centres, surface.astype(np.float64))
     asked = (object_ | ring) & (surface > 0)
     told, by_picture = np.zeros((2, *asked.shape), bool)
     expected = photo.copy()
-    colours, told[asked] = shown(others, points[asked], SAME, tolerance)
+    colours, told[asked] = shown(others, points[asked], SAME_DEPTH, tolerance)
     expected[told] = colours[told[asked]]
     if given is not None:
         left = object_ & asked & ~told
         depth_given = np.where(given.target, given.depth, 0)
         by_picture[left] = sees(given.camera, depth_given, points[left], tolerance)
-        expected[by_picture] = _colours(given.image, given.camera, points[by_picture])
+        expected[by_picture] = colours_at(given.image, given.camera.project(points[by_picture])[0])
     foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~object_ | told | by_picture)
     unknown = object_ & ~told & ~by_picture
     expected[unknown] = foretold[unknown]
@@ -320,23 +315,11 @@ def shown(
     seen &= ask(witnesses, points, tolerance) != Says.BEHIND
     colours = np.full((len(witnesses), len(points), 3), np.nan, np.float32)
     for k, witness in enumerate(witnesses):
-        colours[k, seen[k]] = _colours(witness.photo, witness.camera, points[seen[k]])
+        colours[k, seen[k]] = colours_at(witness.photo, witness.camera.project(points[seen[k]])[0])
     told, median = seen.any(0), np.zeros((len(points), 3), np.float32)
     if told.any():
         median[told] = np.nanmedian(colours[:, told], axis=0)
     return median, told
-
-
-def _colours(
-    picture: np.ndarray,  # [H, W, 3] uint8
-    camera: Camera,
-    points: np.ndarray,  # [N, 3]
-) -> np.ndarray:
-    """[N, 3] float32, between pixels."""
-    if not len(points):
-        return np.zeros((0, 3), np.float32)
-    x, y = (camera.project(points)[0] - 0.5).astype(np.float32).T[:, :, None].copy()
-    return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.float32)
 
 
 def _shift(look: _Look, thin: tuple[slice, slice], points: np.ndarray, surface: np.ndarray, eye: Camera) -> np.ndarray:
@@ -361,15 +344,12 @@ def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence
     points = gaussians.means.astype(np.float64)
     before, other = np.zeros((2, len(points)), bool)
     for chart in charts:
-        uv, z = chart.camera.project(points)
-        with np.errstate(invalid="ignore"):
-            framed = (z > 0) & (uv >= 0).all(1) & (uv < [chart.camera.width, chart.camera.height]).all(1)
-        cols, rows = uv[framed].astype(int).T
-        nearer = z[framed] < chart.depth[rows, cols] - SCATTER * chart.noise
-        before[framed] |= chart.there[rows, cols] & nearer
-        other[framed] |= chart.there[rows, cols] & ~nearer
+        index, rows, cols, z = framed(chart.camera, points)
+        there, nearer = chart.there[rows, cols], z < chart.depth[rows, cols] - SCATTER * chart.noise
+        before[index] |= there & nearer
+        other[index] |= there & ~nearer
     rows = np.flatnonzero(before & ~other & gaussians.usable)
-    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME))
+    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME_DEPTH))
     found = np.zeros(len(points), bool)
     found[rows] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     return found
@@ -385,36 +365,25 @@ def _words(v: Verdict) -> tuple[str, ...]:
     """What it comes to; then, of each thing that is amiss, how much, and what to do."""
     level = "good" if v.score >= GOOD else "fair" if v.score >= FAIR else "poor"
     times = 10 ** (v.expected_error / 20)
-    detail = 1.0 if v.sharpness is None else v.sharpness
-    amiss = (
-        (
-            v.open_share > 0.02,
-            f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best",
-        ),
-        (
-            v.remains > 0.05,
-            f"{v.remains:.0%} of the object's place still looks like it: enlarge the box until all of it is inside",
-        ),
-        (
-            (v.haze or 0) > 0.05,
-            f"haze covers {v.haze or 0:.0%} of what was behind the object: enlarge the box, or add one round the haze",
-        ),
-        (
-            (v.ring_fidelity or 0) < -0.5,
-            f"the surroundings lost {-(v.ring_fidelity or 0):.1f} dB against the photos: make the box tighter",
-        ),
-        (
-            not 0.5 < detail < 2,
-            f"the fill has {detail:.1f} times the detail of its surroundings: paint one view, or try another seed",
-        ),
-        (
-            v.agreement is not None and v.agreement < 0.7,
-            f"only {v.agreement or 0:.0%} of the object's place looks as photos show it: mark shadows and reflections",
-        ),
-        (
-            v.invented > 0.3,
-            f"no photo shows {v.invented:.0%} of the object's place: paint one view if the fill does not convince",
-        ),
-    )
-    first = f"{level}: errors where the object was are probably {times:.1f} times those round it"
-    return (first, *(words for wrong, words in amiss if wrong))
+    words = [f"{level}: errors where the object was are probably {times:.1f} times those round it"]
+    if v.open_share > 0.02:
+        words.append(f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best")
+    if v.remains > 0.05:
+        place = f"{v.remains:.0%} of the object's place still looks like it"
+        words.append(f"{place}: enlarge the box until all of it is inside")
+    if v.haze is not None and v.haze > 0.05:
+        haze = f"haze covers {v.haze:.0%} of what was behind the object"
+        words.append(f"{haze}: enlarge the box, or add one round the haze")
+    if v.ring_fidelity is not None and v.ring_fidelity < -0.5:
+        lost = f"the surroundings lost {-v.ring_fidelity:.1f} dB against the photos"
+        words.append(f"{lost}: make the box tighter")
+    if v.sharpness is not None and not 0.5 < v.sharpness < 2:
+        detail = f"the fill has {v.sharpness:.1f} times the detail of its surroundings"
+        words.append(f"{detail}: paint one view, or try another seed")
+    if v.agreement is not None and v.agreement < 0.7:
+        alike = f"only {v.agreement:.0%} of the object's place looks as photos show it"
+        words.append(f"{alike}: mark shadows and reflections")
+    if v.invented > 0.3:
+        unknown = f"no photo shows {v.invented:.0%} of the object's place"
+        words.append(f"{unknown}: paint one view if the fill does not convince")
+    return tuple(words)

@@ -1,6 +1,6 @@
 """What the views together have seen of the scene: each point of space is judged once, whichever view asks.
 
-That makes target regions consistent between views by construction (METHOD section 1).
+That makes target regions consistent between views by construction.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
-from .outline import Window, surface_points
+from ..geometry import SAME_DEPTH, Window, framed, pack_camera, project, surface_points
 
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
 HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
@@ -23,7 +23,7 @@ HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a
 class Sight:
     """How far every pixel of every view sees past the object."""
 
-    cameras: np.ndarray  # [V, 19] float64: rotation, translation, fx, fy, cx, cy, width, height, distance of the centre
+    cameras: np.ndarray  # [V, 19] float64, packed, and the distance of the object's centre
     starts: np.ndarray  # [V] int64, a view's first pixel
     limits: np.ndarray  # float32, z of the first surface of every pixel; HIDDEN where there is none
 
@@ -36,10 +36,7 @@ class Sight:
         """From depth maps [H, W], 0 = nothing, and masks [H, W] bool of the object and of what else hides the scene."""
         order = [views[k] for k in _spread_order(len(views))]
         away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
-        packed = [
-            np.concatenate([c.R.ravel(), c.t, [c.fx, c.fy, c.cx, c.cy, c.width, c.height, far]])
-            for (c, _, _), far in zip(order, away)
-        ]
+        packed = [np.append(pack_camera(c), far) for (c, _, _), far in zip(order, away)]
         limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
@@ -66,7 +63,7 @@ def depth_agreement(
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
     windows: Sequence[Window],  # the parts to look at
-    tolerance: float,  # relative z
+    tolerance: float = SAME_DEPTH,  # relative z
     samples: int = 1000,  # per view
 ) -> float:
     """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.
@@ -82,11 +79,8 @@ def depth_agreement(
         apart[k] = np.inf
         other = int(apart.argmin())
         _, _, points = surface_points(cameras[k], depths[k], windows[k])
-        uv, z = cameras[other].project(points[:: max(1, len(points) // samples)])
-        height, width = depths[other].shape
-        framed = (z > 0) & (uv >= 0).all(1) & (uv < [width, height]).all(1)
-        cols, rows = uv[framed].astype(int).T
-        there, z = depths[other][rows, cols], z[framed]
+        _, rows, cols, z = framed(cameras[other], points[:: max(1, len(points) // samples)])
+        there = depths[other][rows, cols]
         coarse = max(tolerance, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
         through = (there > z * (1 + coarse)) | (there == 0)
         return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
@@ -110,11 +104,7 @@ def _find_view(lo, hi, points, cameras, starts, limits, tolerance, found):
         hidden = 0  # views in which the object hides the point, less those in which a surface does
         for v in range(len(cameras)):
             c = cameras[v]
-            depth = c[6] * x + c[7] * y + c[8] * z + c[11]
-            if not depth > 0:
-                continue
-            col = c[12] * (c[0] * x + c[1] * y + c[2] * z + c[9]) / depth + c[14]
-            row = c[13] * (c[3] * x + c[4] * y + c[5] * z + c[10]) / depth + c[15]
+            col, row, depth = project(c, x, y, z)
             if not (0 <= col < c[16] and 0 <= row < c[17]):
                 continue
             limit = limits[starts[v] + int(row) * int(c[16]) + int(col)]

@@ -12,8 +12,8 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel, kernel
 from ..compute.threads import parallel_map, run_ranges
+from ..geometry import cropped
 from ..raster import Window
-from .outline import cropped
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUD = 127  # grey levels beyond which a difference counts no more; kept as int8

@@ -14,7 +14,7 @@ from test_raster_render import CAMERA, one, posed, random_scene
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices
 from gimp3d.raster import PASSES, RasterSettings, Rendering, contributions, footprint, render
-from gimp3d.solvers.harmonics import rotate_sh
+from gimp3d.sh import sh_basis
 
 torch = pytest.importorskip("torch")
 from torch_reference import Pictures, draw  # noqa: E402 (needs torch)
@@ -33,6 +33,14 @@ def surfel(scale: float | tuple[float, float] = 0.1, **changes: object) -> Gauss
 def turned_about_x(degrees: float) -> tuple[float, float, float, float]:
     half = np.deg2rad(degrees) / 2
     return float(np.cos(half)), float(np.sin(half)), 0.0, 0.0
+
+
+def turned_sh(sh: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Coefficients [N, K, 3] of the colours that are seen along turned directions as `sh`'s are along the old ones."""
+    d = np.random.default_rng(0).normal(size=(64, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    before, after = (sh_basis(towards, round(sh.shape[1] ** 0.5) - 1) for towards in (d, d @ turn.T))
+    return np.asarray(np.linalg.pinv(after) @ before @ sh, np.float32)
 
 
 def reference(gaussians: Gaussians, camera: Camera, raster: RasterSettings = BACKGROUND) -> Pictures:
@@ -214,7 +222,7 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing(surfels: bool, degre
         gaussians,
         means=(gaussians.means @ turn.T + shift).astype(np.float32),
         quats=matrices_to_quats(turn @ quats_to_matrices(gaussians.quats.astype(float))).astype(np.float32),
-        sh=rotate_sh(gaussians.sh, turn),
+        sh=turned_sh(gaussians.sh, turn),
     )
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = camera.R @ turn.T, camera.t - camera.R @ turn.T @ shift

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,19 +14,19 @@ from scipy.special import sph_harm_y
 
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, quats_to_matrices
+from gimp3d.gaussians import SH_C0
+from gimp3d.sh import sh_basis
+from gimp3d.solvers import harmonics
 from gimp3d.solvers.harmonics import (
     HarmonicsFit,
     HarmonicsSettings,
     Observations,
     Reason,
-    fit_harmonics,
     gather_observations,
-    rotate_sh,
-    sh_basis,
 )
 
 seeds = st.integers(0, 999)
+fit_harmonics = partial(harmonics.fit_harmonics, floor=0.2)  # these colours have noise, and few are wrong
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:
@@ -70,7 +71,7 @@ def simulated(
     return lobes(towards[:, None], peaks)[:, 0], towards, dense(seen, colours), peaks
 
 
-# ----------------------------------------------------------------------------------------------- basis and rotation
+# ----------------------------------------------------------------------------------------------- ------- the basis
 
 
 def test_the_basis_is_the_real_form_of_the_complex_harmonics() -> None:
@@ -82,23 +83,6 @@ def test_the_basis_is_the_real_form_of_the_complex_harmonics() -> None:
             complex_ = sph_harm_y(degree, abs(m), theta, phi)
             real = complex_.real if m == 0 else np.sqrt(2) * (complex_.real if m > 0 else complex_.imag)
             np.testing.assert_allclose(sh_basis(d, degree)[:, degree**2 + degree + m], real, atol=1e-12)
-
-
-@examples(60)
-@given(seed=seeds, degree=st.integers(0, 3), mirrored=st.booleans())
-def test_rotated_coefficients_show_the_same_colours_along_rotated_directions(
-    seed: int, degree: int, mirrored: bool
-) -> None:
-    rng = np.random.default_rng(seed)
-    sh, towards = rng.normal(size=(4, (degree + 1) ** 2, 3)), directions(4 * 9, seed).reshape(4, 9, 3)
-    each = quats_to_matrices(rng.normal(size=(4, 4)))
-    if mirrored:
-        each = each @ np.diag([1.0, -1.0, 1.0])
-    back, turned = np.swapaxes(each, 1, 2), rotate_sh(sh, each)
-    np.testing.assert_allclose(seen_colours(turned, towards @ back), seen_colours(sh, towards), atol=1e-12)
-    np.testing.assert_allclose((turned**2).sum(1), (sh**2).sum(1), rtol=1e-12)  # orthogonal
-    np.testing.assert_allclose(rotate_sh(turned, back), sh, atol=1e-12)
-    np.testing.assert_allclose(rotate_sh(sh, each[0])[0], turned[0], atol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------- what a fit must be
@@ -127,7 +111,7 @@ def test_true_coefficients_are_found_from_enough_directions() -> None:
     observed = dense(seen, seen_colours(true, seen))
     fixed = fit_harmonics(anchors, towards, observed, 2, HarmonicsSettings(ridge=1e-4))
     np.testing.assert_allclose(fixed.sh, true, atol=2e-4)
-    chosen = fit_harmonics(anchors, towards, observed, settings=HarmonicsSettings(floor=0.01))
+    chosen = fit_harmonics(anchors, towards, observed, floor=0.01)
     assert (chosen.degree == 2).mean() > 0.9 and (chosen.reasons == Reason.VIEW_DEPENDENT).all()
     np.testing.assert_allclose(chosen.sh[:, :9], true, atol=5e-3)
 
@@ -163,7 +147,7 @@ def reference_fit(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The rule of fit_harmonics in dense float64: coefficients above 0, degrees, errors, ranks.
 
-    The offset that the kernel eliminates is a column of ones here.
+    The offset that the fit eliminates is a column of ones here.
     """
     r, apart = colours - anchors[:, None], seen - towards[:, None]
     size = np.linalg.norm(r, axis=-1)
@@ -211,24 +195,24 @@ def reference_fit(
 
 
 @pytest.mark.parametrize(("views", "spread"), [(6, 0.8), (25, 0.2), (60, 0.5), (130, 0.1)])
-def test_the_kernel_does_what_the_rule_says(views: int, spread: float) -> None:
+def test_the_fit_does_what_the_rule_says(views: int, spread: float) -> None:
     anchors, towards, observed, _ = simulated(75, views, spread, views)
     seen, colours = observed.directions.reshape(75, views, 3), observed.colours.reshape(75, views, 3)
     rng = np.random.default_rng(1)
     weights = rng.uniform(0.3, 1.5, (75, views)) * (rng.random((75, views)) < rng.uniform(0.5, 1, (75, 1)))  # ragged
     for degree, floor, offset in ((3, 0.2, False), (2, 5.0, True), (1, 0.05, False), (3, 1.0, True)):
-        asked = HarmonicsSettings(floor, offset)
-        fit = fit_harmonics(anchors, towards, dense(seen, colours, weights), degree, asked)
+        asked = HarmonicsSettings(offset)
+        fit = fit_harmonics(anchors, towards, dense(seen, colours, weights), degree, asked, floor=floor)
         found, degrees, errors, ranks = reference_fit(anchors, towards, seen, colours, weights, degree, floor, offset)
         posed = fit.reasons < Reason.ONE_DIRECTION
         same = posed & (fit.degree == degrees)
-        assert posed.mean() > 0.8 and same.sum() > 0.97 * posed.sum()  # float32 may settle a draw the other way
+        assert posed.mean() > 0.8 and same.sum() == posed.sum()
         everywhere = directions(100)
         basis = sh_basis(everywhere, degree)[:, 1:]
         ours = np.einsum("vk,nkc->nvc", basis, fit.sh[same, 1:])
-        np.testing.assert_allclose(ours, np.einsum("vk,nkc->nvc", basis, found[same]), atol=5e-4)
-        np.testing.assert_allclose(fit.error[same], errors[same], rtol=1e-3, atol=1e-5)
-        np.testing.assert_allclose(fit.rank[same], ranks[same], rtol=1e-3)
+        np.testing.assert_allclose(ours, np.einsum("vk,nkc->nvc", basis, found[same]), atol=1e-6)
+        np.testing.assert_allclose(fit.error[same], errors[same], rtol=1e-5)
+        np.testing.assert_allclose(fit.rank[same], ranks[same], rtol=1e-5)
 
 
 def test_errors_are_those_of_fits_without_the_observation() -> None:
@@ -373,7 +357,7 @@ def test_one_wrong_observation_in_ten_costs_little() -> None:
 
 def test_the_floor_holds_where_no_view_has_looked() -> None:
     anchors, towards, observed, peaks = simulated(400, 10, 0.15, 21)
-    bold, usual = (fit_harmonics(anchors, towards, observed, 3, HarmonicsSettings(floor)) for floor in (1e-4, 0.2))
+    bold, usual = (fit_harmonics(anchors, towards, observed, floor=floor) for floor in (1e-4, 0.2))
     assert error_of(usual, towards, peaks, 0.5) < 0.8 * error_of(bold, towards, peaks, 0.5)
 
 

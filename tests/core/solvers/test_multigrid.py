@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from property_tests import examples
 
-from gimp3d.solvers import multigrid
-from gimp3d.solvers.multigrid import Multigrid, places_of
+from gimp3d.solvers.poisson import multigrid
+from gimp3d.solvers.poisson.multigrid import Multigrid, places_of
 
 MASKS = hnp.arrays(np.bool_, st.tuples(st.integers(1, 25), st.integers(1, 25)))
 

@@ -208,7 +208,7 @@ def test_a_discrete_harmonic_function_is_reproduced():
 
 
 def test_a_bump_in_the_guidance_becomes_a_bump():
-    """The paper prints the divergence with the wrong sign, which makes it a dent (METHOD section 3)."""
+    """The paper prints the divergence with the wrong sign, which makes it a dent (docs/method.md)."""
     y, x = np.mgrid[:61, :61] - 30.0
     bump = np.exp(-(x**2 + y**2) / 60)
     hole = np.hypot(x, y) < 25

@@ -12,9 +12,10 @@ from scenes import REGION, cameras
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
+from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find_planes, first_hits
-from gimp3d.stages.masks import ViewMasks, sees
+from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Witness, ask
 
 FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset

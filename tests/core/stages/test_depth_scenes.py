@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from gimp3d.box import read_region
+from gimp3d.geometry import disparity_of
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.ply import read_ply
 from gimp3d.stages.depth import complete_depth
 from gimp3d.stages.layers import distance_to
 from gimp3d.stages.masks import find_masks
-from gimp3d.stages.reference import disparity_of, rim
+from gimp3d.stages.reference import rim
 
 
 @pytest.mark.slow

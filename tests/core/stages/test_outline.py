@@ -10,16 +10,10 @@ from scenes import cameras, scene
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
+from gimp3d.geometry import window_round
 from gimp3d.orbit import look_at
-from gimp3d.raster import footprint, render, surface_depth, touched_window
-from gimp3d.stages.outline import (
-    box_polygon,
-    box_window,
-    cropped,
-    fill_polygon,
-    surface_points,
-    window_round,
-)
+from gimp3d.raster import footprint, touched_window
+from gimp3d.stages.outline import box_polygon, box_window, fill_polygon
 
 
 def some_camera(rng: np.random.Generator, eye: np.ndarray) -> Camera:
@@ -88,27 +82,9 @@ def test_gaussians_touch_nothing_outside_their_window(seed: int) -> None:
     assert not weight.any()
 
 
-def test_a_part_of_a_view_shows_the_same() -> None:
-    g, camera = scene(), cameras()[4]
-    window = (slice(20, 70), slice(31, 90))
-    whole, part = render(g, camera), render(g, cropped(camera, window))
-    inner = (slice(25, 65), slice(36, 85))  # splats outside a picture are drawn with a clamped slope (Kerbl 2023)
-    assert np.abs(whole.rgb[inner] - part.rgb[5:45, 5:54]).max() < 0.02
-    rows, cols, points = surface_points(camera, surface_depth(g, camera)[0], window, 3)
-    uv, z = camera.project(points)
-    assert np.abs(uv - np.stack([cols + 0.5, rows + 0.5], -1)).max() < 1e-6 and (z > 0).all()
-    assert set(np.unique(rows - 20) % 3) == {0} and set(np.unique(cols - 31) % 3) == {0}
-
-
 def test_windows_of_what_lies_behind_the_camera() -> None:
     camera = cameras()[0]
     g = scene().take(np.arange(3))
     g.means[:] = camera.centre - 5 * camera.forward
     rows, cols = touched_window(g, camera)
     assert (rows.stop - rows.start) * (cols.stop - cols.start) == 1
-
-
-def test_a_window_of_a_view_may_be_empty() -> None:
-    """A view of which nothing is painted is a part of no pixels, and no fault."""
-    part = cropped(cameras(1)[0], (slice(3, 3), slice(5, 5)))
-    assert (part.width, part.height) == (0, 0)

@@ -1,4 +1,4 @@
-"""Choosing the reference, and what photos show of the hidden surface."""
+"""Choosing the reference."""
 
 from __future__ import annotations
 
@@ -6,24 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import REGION, cameras, scene, truth
+from scenes import REGION, cameras, scene
 
 from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
 from gimp3d.orbit import look_at
-from gimp3d.pipeline import render_bytes
-from gimp3d.raster import render
 from gimp3d.stages.masks import find_masks
-from gimp3d.stages.reference import (
-    EvidenceSettings,
-    ReferenceSettings,
-    _coarse,
-    choose_reference,
-    facing,
-    gather_evidence,
-    needed_surface,
-    surface_normals,
-)
+from gimp3d.stages.reference import ReferenceSettings, _coarse, choose_reference, needed_surface
 
 UP = np.array([0, 0, 1.0])
 
@@ -104,43 +93,3 @@ def test_a_wanted_view_is_taken_unless_it_does_not_see_the_hole() -> None:
         choose_reference(masks.views, "elsewhere")
     with pytest.raises(IllPosed, match="no view"):
         choose_reference([])
-
-
-def test_normals_and_facing_of_a_tilted_plane() -> None:
-    camera = Camera("c", 40, 30, 35, 35, 20, 15, np.eye(4))
-    normal = np.array([0.2, -0.5, -1.0])
-    normal /= np.linalg.norm(normal)
-    rays = camera.unproject(camera.pixel_centres(), np.ones((30, 40)))
-    depth = (normal @ np.array([0, 0, 3.0])) / (rays @ normal)
-    depth[10, 10] = 0
-    found = surface_normals(camera, depth)
-    there = np.ones((30, 40), bool)
-    there[9:12, 9:12] = False
-    np.testing.assert_allclose(found[there], np.broadcast_to(normal, (there.sum(), 3)), atol=1e-9)
-    expected = -(rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ normal
-    np.testing.assert_allclose(facing(camera, depth)[there], expected[there], atol=1e-9)
-
-
-def test_an_edge_does_not_tilt_the_normals_beside_it() -> None:
-    camera = Camera("c", 40, 30, 35, 35, 20, 15, np.eye(4))
-    depth = np.full((30, 40), 4.0)
-    depth[:, 20:] = 2.0
-    found = surface_normals(camera, depth)
-    np.testing.assert_allclose(found, np.broadcast_to([0, 0, -1.0], found.shape), atol=1e-9)
-
-
-def test_evidence_is_the_true_colour_and_never_the_objects() -> None:
-    views = cameras(12)
-    masks = find_masks(scene(), REGION, views)
-    view = masks.views[0]
-    true = render(truth(), view.camera)
-    sources = [(v.camera, render_bytes(scene(), v.camera), v.depth_before) for v in masks.views]
-    evidence = gather_evidence(
-        view.camera, true.median_depth, view.silhouette, sources, EvidenceSettings(tolerance=0.02)
-    )
-    assert evidence.seen.any() and not (evidence.seen & ~view.silhouette).any()
-    difference = np.abs(evidence.image[evidence.seen].astype(float) - 255 * np.clip(true.rgb[evidence.seen], 0, 1))
-    assert np.median(difference) < 4 and np.percentile(difference, 95) < 25
-    points = view.camera.unproject(view.camera.pixel_centres(), true.median_depth.astype(float))
-    under = (np.abs(points[..., :2]) < 0.2).all(-1) & (true.median_depth > 0)
-    assert not evidence.seen[under].any()  # nobody sees under the block

@@ -201,7 +201,7 @@ def test_colours_that_change_with_the_view_are_learnt_from_painted_pixels_alone(
     means = seeds.means.astype(float)
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
-    loose = SeedSettings(harmonics=HarmonicsSettings(floor=0.01, offset=True))
+    loose = SeedSettings(harmonics=HarmonicsSettings(ridge=0.01, offset=True))
     coloured = colour_gaussians(seeds, reference, everywhere, painted, 3, loose)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9

@@ -15,7 +15,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.gaussians import quats_to_matrices
 from gimp3d.orbit import orbit_cameras
-from gimp3d.stages.surroundings import SurroundingsSettings, follow_surroundings
+from gimp3d.stages.surroundings import THICKNESS, follow_surface
 
 Height = Callable[[np.ndarray], np.ndarray]  # signed height of points [N, 3] above the surface, about in scene units
 CUBE = 0.5
@@ -72,14 +72,14 @@ def points_of(views: list, box: Box) -> np.ndarray:
 def test_surface_is_followed_to_the_object_and_no_further(surface: Height, thing: Height, size: float) -> None:
     box = Box.make([0, 0, 0.26], np.array([0.9, 0.9, 0.66]) * size)
     views = views_of(surface, thing)
-    found = follow_surroundings(box, (box,), views)
+    found = follow_surface(box, (box,), views)
     points = points_of(views, box)
     off = found.distance(points) / found.cell
     background = (surface(points) < 0.004) & (thing(points) > 2 * found.cell)
     object_ = (thing(points) < 0.004) & (surface(points) > 2 * found.cell)
     assert background.sum() > 500 and object_.sum() > 500
-    assert (off[background] < SurroundingsSettings().thickness).mean() > 0.97
-    assert (off[object_] < SurroundingsSettings().thickness).mean() < 0.01
+    assert (off[background] < THICKNESS).mean() > 0.97
+    assert (off[object_] < THICKNESS).mean() < 0.01
 
 
 @examples(8)
@@ -90,7 +90,7 @@ def test_turning_the_world_changes_nothing(seed: int) -> None:
     turn = np.array([np.cos(a := rng.uniform(0, 3)), 0, 0, np.sin(a)])  # about z, so that it holds the cube
     box = Box.make([0, 0, 0.26], [0.95, 0.95, 0.66], turn)
     views = views_of(ground, cube)
-    found = follow_surroundings(box, (box,), views)
+    found = follow_surface(box, (box,), views)
     points = points_of(views, box)
     off = found.distance(points) / found.cell
     assert (off[(points[:, 2] < 0.004) & (cube(points) > 2 * found.cell)] < 0.5).mean() > 0.95
@@ -101,7 +101,7 @@ def test_turning_the_world_changes_nothing(seed: int) -> None:
 def test_an_object_that_reaches_beyond_the_box_is_not_its_surroundings() -> None:
     box = Box.make([0, 0, 0.35], [0.4, 0.4, 0.5])  # the cube's sides and foot lie outside
     views = views_of(ground, cube)
-    found = follow_surroundings(box, (box,), views)
+    found = follow_surface(box, (box,), views)
     points = points_of(views, box)
     assert len(points) > 500 and np.isinf(found.distance(points)).mean() > 0.99
 
@@ -110,7 +110,7 @@ def test_growth_does_not_start_in_another_box_of_the_region() -> None:
     halves = (Box.make([-0.2, 0, 0.26], [0.5, 0.9, 0.66]), Box.make([0.2, 0, 0.26], [0.5, 0.9, 0.66]))
     views = views_of(ground, cube)
     for half in halves:
-        found = follow_surroundings(half, halves, views)
+        found = follow_surface(half, halves, views)
         points = points_of(views, half)
         assert (found.distance(points[points[:, 2] > 3 * found.cell]) < 0.5 * found.cell).mean() < 0.01
 
@@ -118,7 +118,7 @@ def test_growth_does_not_start_in_another_box_of_the_region() -> None:
 def test_nothing_to_follow() -> None:
     box = Box.make([0, 0, 0.26], [0.9, 0.9, 0.66])
     camera = orbit_cameras((box,), 1, (0, 0, 1), 80, 60, 50)[0]
-    found = follow_surroundings(box, (box,), [(camera, np.zeros((60, 80), np.float32))])
+    found = follow_surface(box, (box,), [(camera, np.zeros((60, 80), np.float32))])
     assert np.isinf(found.distance(np.zeros((4, 3)))).all()
     broken = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e30]])
     assert np.isinf(found.distance(broken)).all()

@@ -10,9 +10,8 @@ from scenes import cameras, scene
 
 from gimp3d.camera import Camera
 from gimp3d.compute.threads import set_thread_count
+from gimp3d.geometry import sees, surface_points
 from gimp3d.raster import surface_depth
-from gimp3d.stages.masks import sees
-from gimp3d.stages.outline import surface_points
 from gimp3d.stages.visibility import BURIED, HIDES, SEEN_PAST, SHOWN, Sight, depth_agreement
 
 CAMERAS = [c.scaled(f) for c, f in zip(cameras(), (1, 0.5, 1.3, 0.77, 1, 1, 1, 1, 1))]

@@ -1,7 +1,7 @@
-"""Poisson's equation on irregular holes of an image: depth completion and seamless blending stand on it.
+"""The equations of a hole: what its pixels are tied to, and how strongly; `multigrid.py` solves them.
 
 What is solved for is the difference to the guidance plus a constant for each component of the hole. It is smooth, and
-its right-hand side is the mismatch along the rim. `multigrid.py` solves it.
+its right-hand side is the mismatch along the rim.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ..compute.jit import exact_kernel, kernel
+from ...compute.jit import exact_kernel, kernel
 from .multigrid import Multigrid, places_of
 
 HOLE, KNOWN = 1, 16  # kinds of pixels: a sum over the four neighbours counts both
@@ -62,7 +62,8 @@ def solve_poisson(
 ) -> PoissonSolution:
     """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
 
-    This is paper 3.3 with its sign mended (METHOD section 3). Neighbours that are neither hole nor known, and the
+    This is paper 3.3 with its sign mended (docs/method.md): the solution's gradients are the guidance's, not their
+    opposites. Neighbours that are neither hole nor known, and the
     image's border, are natural (Neumann): they are dropped on both sides. A pair of pixels of which one has no finite
     guidance wants no gradient; known pixels that are not finite are not known; weights and anchors that are not
     finite do not count, nor weights below 1e-30; 1e30 is the most.
@@ -148,7 +149,8 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     if not count:
         return HoleSolution(result, 0, np.zeros(0, bool))
 
-    # u = the guidance + a constant for each part of the hole + what is solved for
+    # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for. `result` begins
+    # as the guidance, and a rim pixel is tied to (known − guidance): see _known_ties.
     absent = None
     if task.guidance is not None and not _take(task.guidance.reshape(h, -1), runs, channels, result.reshape(-1)):
         absent = ~np.isfinite(result)
@@ -191,7 +193,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
 
 
 def _known_ties(task: _Task, rim: np.ndarray, start: np.ndarray, absent: np.ndarray | None) -> _Ties:
-    """To known neighbours that are finite."""
+    """The hole's pixels to their known neighbours, where those are finite."""
     unknowns, rows, columns = rim.T
     known = task.values[rows - 1, columns - 1].astype(np.float64)
     if not np.isfinite(known).all():
@@ -206,7 +208,7 @@ def _known_ties(task: _Task, rim: np.ndarray, start: np.ndarray, absent: np.ndar
 
 
 def _soft_ties(task: _Task, weight: np.ndarray, start: np.ndarray) -> _Ties:
-    """To anchors."""
+    """Pixels to their anchors, as strongly as `weight` says."""
     pull = weight[task.hole].astype(np.float64)
     anchor = np.zeros(start.shape) if task.anchor is None else task.anchor[task.hole].astype(np.float64)
     unknowns = np.flatnonzero((pull > LEAST_WEIGHT) & np.isfinite(pull) & np.isfinite(anchor).all(1))
@@ -215,7 +217,7 @@ def _soft_ties(task: _Task, weight: np.ndarray, start: np.ndarray) -> _Ties:
 
 
 def _flat_ties(kind: np.ndarray, start: np.ndarray, absent: np.ndarray) -> Iterator[_Ties]:
-    """Pairs of which one has no guidance want no gradient, not the one that `start` has there."""
+    """Pairs of neighbours of which one has no guidance are guided by a gradient of 0, not by the start's."""
     index = np.full(kind.shape, -1)
     index[kind == HOLE] = np.arange(len(start))
     for neighbour in (np.roll(index, -1, 0), np.roll(index, -1, 1)):

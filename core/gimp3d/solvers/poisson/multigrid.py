@@ -1,5 +1,8 @@
 """Conjugate gradients preconditioned by a geometric multigrid cycle, on the pixels of an irregular hole.
 
+More than 500 lines, as its kernels share one layout of the grids; pyamg, which could stand in, is 15–27 times slower
+(`make bench-poisson`).
+
 A·u = right, where A is a diagonal D less the adjacency of the hole's pixels (4 neighbours): the discrete Poisson
 equation. Multigrid as a preconditioner: Tatebe 1993; on irregular domains: McAdams et al. 2010.
 
@@ -30,8 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compute import buffers
-from ..compute.jit import inline_kernel, kernel
+from ...compute.jit import inline_kernel, kernel
 
 DIGITS = 5e-6  # by which float32 may lower the residual before it is found anew
 COARSEST = 16  # nodes of the last grid, solved directly
@@ -104,19 +106,19 @@ class Multigrid:
         rows, columns = inside.shape
         stride = row_stride(columns // 2 + 1)
         kind = np.dtype(precision).type
-        self.inverse, self.right, self.u = buffers.zeros((3, 2, rows * stride), kind)
+        self.inverse, self.right, self.u = np.zeros((3, 2, rows * stride), kind)
         if kind is np.float32:
             inverse = self.inverse
         else:
-            inverse = buffers.zeros(self.inverse.shape, np.float32)
-        diagonal, *fine_vectors = buffers.zeros((6, rows * stride), np.float32)
+            inverse = np.zeros(self.inverse.shape, np.float32)
+        diagonal, *fine_vectors = np.zeros((6, rows * stride), np.float32)
         np.add.at(self.inverse.reshape(-1), places, strengths.astype(kind))
         first, spans = _find_spans(runs, rows, stride)
         flags = np.zeros(inside.shape, np.uint8)
         _fill(inside, first, spans, stride, self.inverse, inverse, diagonal, flags)
         self.fine = Fine(rows, stride, diagonal, inverse, first, spans)
         self.coarse = _coarsen(flags, self.fine)
-        self.work = Work(*fine_vectors, *buffers.zeros((3, self.coarse.steps.size), np.float32))
+        self.work = Work(*fine_vectors, *np.zeros((3, self.coarse.steps.size), np.float32))
 
     def solve(
         self,
@@ -437,7 +439,7 @@ def _coarsen(flags: np.ndarray, fine: Fine) -> Coarse:
     first = np.zeros(row_ends[-1] + 1, np.int64)
     spans = np.empty((sum(r * (c // GAP + 1) for r, c in nodes), 2), np.uint64)
     marks = np.zeros(ends[-1], np.uint8)
-    stencils = buffers.zeros((6, ends[-1] + strides[-1]), np.float32)
+    stencils = np.zeros((6, ends[-1] + strides[-1]), np.float32)
     places = strides.astype(np.uint64), offsets.astype(np.uint64)
     _build(flags, fine, np.array(nodes), rows, *places, first_rows, first, spans, marks, stencils[:5], stencils[5])
     last = (np.flatnonzero(marks[offsets[-1] :]) + offsets[-1]).astype(np.uint64)
