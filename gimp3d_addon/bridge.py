@@ -23,17 +23,13 @@ from gimp3d.errors import BadInput
 from gimp3d.io.cameras import make_camera, rigid
 
 from . import trust
+from .chosen import present
 
 BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera's own axes: y up, z backward → y down, z forward
 CAMERA = "gimp3d_camera"  # custom property of imported cameras: exact intrinsics, ID and photo as JSON
 CHART = "gimp3d_chart"  # custom property of cameras that face a hidden surface: N of the reference chart:N
 SENSOR = 36.0  # mm, of imported cameras
 STRAIGHT = 1e-6  # from here on a turn is meant: Blender's own quarter turns are off by 4e-8
-
-
-def present(scene: bpy.types.Scene, obj: bpy.types.Object | None) -> bpy.types.Object | None:
-    """The object, unless the user has deleted it: a pointer to it keeps a deleted object in the file."""
-    return obj if obj is not None and scene.objects.get(obj.name) == obj else None
 
 
 def splat_frame(obj: bpy.types.Object) -> np.ndarray:
@@ -79,9 +75,7 @@ def camera_from_blender(
     BadInput
         If it is not a perspective camera.
     """
-    data = obj.data
-    if data.type != "PERSP":
-        raise BadInput(f"camera {obj.name} is {data.type.lower()}; only perspective cameras can be views")
+    _require_perspective(obj)
     pose = np.array(obj.evaluated_get(depsgraph).matrix_world, dtype=np.float64)
     local = np.linalg.inv(frame) @ pose
     u, _, vt = np.linalg.svd(local[:3, :3])
@@ -108,6 +102,11 @@ def camera_from_blender(
     fx, fy = width / 2 * p[0][0], height / 2 * p[1][1]
     cx, cy = width / 2 * (1 - p[0][2]), height / 2 * (1 + p[1][2])
     return Camera(name or safe_name(obj.name), width, height, fx, fy, cx, cy, viewmat)
+
+
+def _require_perspective(obj: bpy.types.Object) -> None:
+    if obj.data.type != "PERSP":
+        raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
 
 
 def render_size(scene: bpy.types.Scene) -> tuple[int, int]:
@@ -160,17 +159,6 @@ def photo_of(obj: bpy.types.Object) -> Path | None:
     return stored.image if found else None
 
 
-def has_photo(obj: bpy.types.Object) -> bool:
-    """Whether a camera was imported with a photo that may be used, even if it has been moved away from it since."""
-    return photo_of(obj) is not None
-
-
-def has_strange_photo(obj: bpy.types.Object) -> bool:
-    """Whether a camera names a photo where this user never took photos from, or that is gone."""
-    stored = imported(obj)
-    return stored is not None and stored.image is not None and not has_photo(obj)
-
-
 def is_chart(obj: bpy.types.Object | None) -> bool:
     """Whether a camera faces a chart: nothing can be seen from there but its picture, so it is no view."""
     return obj is not None and isinstance(obj.get(CHART), int)
@@ -197,22 +185,11 @@ def camera_to_blender(camera: Camera, frame: Matrix, number: int = 0) -> bpy.typ
     local = Matrix((np.linalg.inv(camera.viewmat) @ BLENDER_TO_OPENCV).tolist())
     location, rotation, _ = (frame @ local).decompose()
     obj.matrix_world = Matrix.LocRotScale(location, rotation, None)
-    obj[CAMERA] = json.dumps(
-        {
-            "id": camera.id,
-            "number": number,
-            "width": camera.width,
-            "height": camera.height,
-            "fx": camera.fx,
-            "fy": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-            "split": camera.split,
-            "viewmat": camera.viewmat.tolist(),
-            "distortion": camera.distortion.coefficients.tolist() if camera.distortion else None,
-            "image": str(camera.image.resolve()) if camera.image and camera.image.exists() else None,
-        }
-    )
+    kept = {name: getattr(camera, name) for name in ("id", "width", "height", "fx", "fy", "cx", "cy", "split")}
+    kept |= {"number": number, "viewmat": camera.viewmat.tolist()}
+    kept["distortion"] = camera.distortion.coefficients.tolist() if camera.distortion else None
+    kept["image"] = str(camera.image.resolve()) if camera.image and camera.image.exists() else None
+    obj[CAMERA] = json.dumps(kept)
     return obj
 
 
@@ -281,8 +258,8 @@ class ViewSize:
 
     width: int  # pixels
     height: int
-    photo: bool
-    strange_photo: bool  # has one that may not be used
+    photo: bool  # imported with one that may be used, even if it has been moved away from it since
+    strange_photo: bool  # with one where this user never took photos from, or that is gone
     sees: bool  # a part of the boxes may be in its picture; always so of an animation's frames
 
 
@@ -301,19 +278,17 @@ def view_sizes(context: bpy.types.Context, boxes: Iterable[bpy.types.Object] = (
     else:
         cameras, times = chosen_cameras(scene), 1
     for obj in cameras:
-        if obj.data.type != "PERSP":
-            raise BadInput(f"camera {obj.name} is {obj.data.type.lower()}; only perspective cameras can be views")
+        _require_perspective(obj)
     animated = settings.views == "ANIMATED"
     corners = [np.array([b.matrix_world @ Vector(c) for c in b.bound_box]) for b in boxes]
-    return [
-        ViewSize(
-            *own_size(obj, scene),
-            has_photo(obj) and not animated,
-            has_strange_photo(obj) and not animated,
-            animated or not corners or any(_may_see(obj, scene, c) for c in corners),
-        )
-        for obj in cameras
-    ] * times
+    found = []
+    for obj in cameras:
+        stored, photo = imported(obj), photo_of(obj)
+        strange = stored is not None and stored.image is not None and photo is None
+        sees = animated or not corners or any(_may_see(obj, scene, c) for c in corners)
+        size = own_size(obj, scene)
+        found.append(ViewSize(*size, photo is not None and not animated, strange and not animated, sees))
+    return found * times
 
 
 def _may_see(
@@ -364,10 +339,7 @@ def _frames(context: bpy.types.Context, frame: np.ndarray) -> Iterator[tuple[Cam
         for number in range(scene.frame_start, scene.frame_end + 1, scene.frame_step):
             scene.frame_set(number)
             depsgraph = context.evaluated_depsgraph_get()
-            yield (
-                camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"),
-                obj,
-            )
+            yield camera_from_blender(obj, frame, scene, depsgraph, f"{safe_name(obj.name)}/{number:04d}"), obj
     finally:
         scene.frame_set(current[0], subframe=current[1])
 

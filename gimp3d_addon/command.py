@@ -1,4 +1,4 @@
-"""`blender --command gimp3d …`: the command line of the library, from Blender (CONTRACT: gimp3d)."""
+"""`blender --command gimp3d …`: the command line of the library, from Blender."""
 
 from __future__ import annotations
 

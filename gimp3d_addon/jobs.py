@@ -24,9 +24,10 @@ from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob, save_job, write_atomically
 
 from . import backdrops, bridge, splats, trust
+from .chosen import current_boxes, current_splat, present
+from .installation import user_folder
 from .lock import is_held
-from .operators.base import current_boxes, current_splat
-from .properties import user_folder
+from .properties import GIMP3D_PG_settings
 
 SHADOW_BEFORE = "shadow before"  # the view as it was before its shadow was painted over
 LOCK = "lock"  # in a job's folder: held by the process that works on it
@@ -228,35 +229,23 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
     context.view_layer.update()
     frame = bridge.splat_frame(splat)
     region = [bridge.box_from_blender(b, frame).to_json() for b in boxes]
-    wanted = bridge.present(context.scene, settings.reference)
-    reference = f"chart:{wanted[bridge.CHART]}" if bridge.is_chart(wanted) else ""
     views = list(bridge.views_of(context, frame))
-    for camera, obj in views:
-        if wanted is not None and obj == wanted and not reference:
-            reference = camera.id
-    painted = settings.reference_paint
-    picture = bpy.path.abspath(settings.reference_image) if settings.reference_image and painted is None else ""
-    if picture and not trust.is_known_photo(Path(picture)):
-        raise BadInput(f"the reference picture {picture} does not exist, or this file brought it along; load it again")
-    if (picture or painted is not None) and not reference:
-        raise BadInput("a reference picture needs its camera; choose the reference view")
-    shaded = next((camera for camera, obj in views if obj == settings.shadow_camera), None)
-    painted_shadow = settings.shadow == "mask"
-    if painted_shadow and (shaded is None or settings.shadow_paint is None):
-        raise BadInput("the shadow is to be as painted, but none is: press Paint Shadow, or choose Undo or Leave")
+    reference = _reference_id(context.scene, views)
+    picture = _reference_picture(settings, reference)
+    shaded = _shaded_view(settings, views)
     file = splats.read_object(splat)
     folder.mkdir(parents=True, exist_ok=True)
-    if painted_shadow:
+    if shaded is not None:
         mask = backdrops.painted_over(settings.shadow_paint, SHADOW_BEFORE)
         backdrops.save_mask(mask, folder / "shadows" / f"{output_name(shaded.id)}.png")
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
     write_transforms(folder / "transforms.json", [_with_photo(c, folder / PHOTOS) for c, _ in views])
     write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
-    if picture:
-        shutil.copyfile(picture, folder / f"reference{Path(picture).suffix}")
-    if painted is not None:
-        picture = str(folder / "reference.png")
-        painted.save(filepath=picture, save_copy=True)
+    copied = folder / f"reference{picture.suffix or '.png'}"
+    if settings.reference_paint is not None:
+        settings.reference_paint.save(filepath=str(copied), save_copy=True)
+    elif picture.name:
+        shutil.copyfile(picture, copied)
     job = RemovalJob(
         scene=str(folder / "scene.ply"),
         cameras=str(folder / "transforms.json"),
@@ -264,19 +253,50 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         out=str(folder / "out.ply"),
         images=str(folder / PHOTOS) if (folder / PHOTOS).is_dir() else "none",
         reference=reference or None,
-        reference_image=str(folder / f"reference{Path(picture).suffix}") if picture else None,
-        inpaint=settings.inpaint,
-        depth_prior=settings.depth_prior,
-        preset=settings.preset,
+        reference_image=str(copied) if picture.name or settings.reference_paint is not None else None,
         report=str(folder / "report"),
         summary=str(folder / "summary.json"),
-        seed=settings.seed,
-        grow=settings.grow,
-        shadow=settings.shadow,
-        shadow_masks=str(folder / "shadows") if painted_shadow else None,
+        shadow_masks=str(folder / "shadows") if shaded is not None else None,
+        **{name: getattr(settings, name) for name in ("inpaint", "depth_prior", "preset", "seed", "grow", "shadow")},
     )
     save_job(folder, job)
     return job
+
+
+Views = list[tuple[Camera, bpy.types.Object]]
+
+
+def _reference_id(scene: bpy.types.Scene, views: Views) -> str:
+    """The chosen reference as the command line names it; empty: the program chooses."""
+    wanted = present(scene, scene.gimp3d.reference)
+    if bridge.is_chart(wanted):
+        return f"chart:{wanted[bridge.CHART]}"
+    found = [camera.id for camera, obj in views if wanted is not None and obj == wanted]
+    return found[-1] if found else ""
+
+
+def _reference_picture(settings: GIMP3D_PG_settings, reference: str) -> Path:
+    """The file of the reference without the object; empty where there is none, or it was painted in Blender."""
+    picture = Path()
+    if settings.reference_image and settings.reference_paint is None:
+        picture = Path(bpy.path.abspath(settings.reference_image))
+        if not trust.is_known_photo(picture):
+            raise BadInput(
+                f"the reference picture {picture} does not exist, or this file brought it along; load it again"
+            )
+    if (picture.name or settings.reference_paint is not None) and not reference:
+        raise BadInput("a reference picture needs its camera; choose the reference view")
+    return picture
+
+
+def _shaded_view(settings: GIMP3D_PG_settings, views: Views) -> Camera | None:
+    """The view whose shadow was painted over, if that is to be undone."""
+    if settings.shadow != "mask":
+        return None
+    shaded = next((camera for camera, obj in views if obj == settings.shadow_camera), None)
+    if shaded is None or settings.shadow_paint is None:
+        raise BadInput("the shadow is to be as painted, but none is: press Paint Shadow, or choose Undo or Leave")
+    return shaded
 
 
 def share_scene(folder: Path) -> None:

@@ -7,10 +7,12 @@ import time
 from pathlib import Path
 
 import bpy
+from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from . import charts, jobs, splats, steps
-from .operators.base import RunsChild, current_splat
+from .chosen import current_splat
+from .operators.base import RunsChild
 from .operators.display import unfit_settings
 from .operators.remove import source_in
 from .operators.roi import FITS, proposed
@@ -78,7 +80,6 @@ def button(layout: bpy.types.UILayout, fix: steps.Fix) -> None:
 class GIMP3D_PT_scene(StepPanel, bpy.types.Panel):
     """The splats"""
 
-    bl_idname = "GIMP3D_PT_scene"
     bl_label = "1  Scene"
     step = staticmethod(steps.scene_step)
 
@@ -95,7 +96,6 @@ class GIMP3D_PT_scene(StepPanel, bpy.types.Panel):
 class GIMP3D_PT_display(Advanced, bpy.types.Panel):
     """How the splats are shown in Blender"""
 
-    bl_idname = "GIMP3D_PT_display"
     bl_label = "Display"
     bl_parent_id = "GIMP3D_PT_scene"
 
@@ -122,7 +122,6 @@ class GIMP3D_PT_display(Advanced, bpy.types.Panel):
 class GIMP3D_PT_region(StepPanel, bpy.types.Panel):
     """The box round the object"""
 
-    bl_idname = "GIMP3D_PT_region"
     bl_label = "2  Region"
     step = staticmethod(steps.region_step)
 
@@ -144,7 +143,6 @@ class GIMP3D_PT_region(StepPanel, bpy.types.Panel):
 class GIMP3D_PT_views(StepPanel, bpy.types.Panel):
     """From where the scene is looked at"""
 
-    bl_idname = "GIMP3D_PT_views"
     bl_label = "3  Views"
     step = staticmethod(steps.views_step)
 
@@ -167,10 +165,29 @@ class GIMP3D_PT_views(StepPanel, bpy.types.Panel):
         row.operator("gimp3d.look_through", text="Next", icon="TRIA_RIGHT").step = 1
 
 
+class GIMP3D_OT_add_preset(AddPresetBase, bpy.types.Operator):
+    """Keep the preset, the fill and the seed under a name, or delete the chosen one"""
+
+    bl_idname = "gimp3d.add_preset"
+    bl_label = "Keep Removal Preset"
+    preset_menu = "GIMP3D_PT_presets"
+    preset_subdir = "gimp3d"
+    preset_defines = ("settings = bpy.context.scene.gimp3d",)
+    preset_values = ("settings.preset", "settings.inpaint", "settings.depth_prior", "settings.seed")
+
+
+class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):
+    """The user's own named settings"""
+
+    bl_label = "Removal Presets"
+    preset_subdir = "gimp3d"
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "gimp3d.add_preset"
+
+
 class GIMP3D_PT_remove(InTab, bpy.types.Panel):
     """Run it"""
 
-    bl_idname = "GIMP3D_PT_remove"
     bl_label = "4  Remove"
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
@@ -244,7 +261,6 @@ class GIMP3D_PT_remove(InTab, bpy.types.Panel):
 class GIMP3D_PT_reference(Advanced, bpy.types.Panel):
     """From where the picture is completed first, and by whom"""
 
-    bl_idname = "GIMP3D_PT_reference"
     bl_label = "Reference View"
     bl_parent_id = "GIMP3D_PT_remove"
 
@@ -268,7 +284,6 @@ class GIMP3D_PT_reference(Advanced, bpy.types.Panel):
 class GIMP3D_PT_fill(Advanced, bpy.types.Panel):
     """Who invents what no view shows"""
 
-    bl_idname = "GIMP3D_PT_fill"
     bl_label = "Fill"
     bl_parent_id = "GIMP3D_PT_remove"
 
@@ -282,7 +297,6 @@ class GIMP3D_PT_fill(Advanced, bpy.types.Panel):
 class GIMP3D_PT_jobs(Advanced, bpy.types.Panel):
     """The folders of this file's removals"""
 
-    bl_idname = "GIMP3D_PT_jobs"
     bl_label = "Job Folders"
     bl_parent_id = "GIMP3D_PT_remove"
 
@@ -305,25 +319,3 @@ class GIMP3D_PT_jobs(Advanced, bpy.types.Panel):
             row.label(text=f"{Path(record.folder).name} · {jobs.size([record]) / 1e6:,.0f} MB · {ago} ago{stopped}")
             row.operator("gimp3d.delete_jobs", text="", icon="TRASH").folder = record.folder
         layout.operator("gimp3d.delete_jobs", text="Delete All but the Newest")
-
-
-class GIMP3D_PT_presets(PresetPanel, bpy.types.Panel):
-    """The user's own named settings"""
-
-    bl_label = "Removal Presets"
-    preset_subdir = "gimp3d"
-    preset_operator = "script.execute_preset"
-    preset_add_operator = "gimp3d.add_preset"
-
-
-CLASSES = (
-    GIMP3D_PT_presets,
-    GIMP3D_PT_scene,
-    GIMP3D_PT_display,
-    GIMP3D_PT_region,
-    GIMP3D_PT_views,
-    GIMP3D_PT_remove,
-    GIMP3D_PT_reference,
-    GIMP3D_PT_fill,
-    GIMP3D_PT_jobs,
-)

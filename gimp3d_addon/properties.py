@@ -1,4 +1,4 @@
-"""scene.gimp3d and the preferences."""
+"""scene.gimp3d: what a removal needs, kept with the scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import splats
+from . import splats, trust
 
 PRESETS = (
     ("draft", "Draft", "One reference view; fastest"),
@@ -45,8 +45,6 @@ class GIMP3D_PG_region(bpy.types.PropertyGroup):
 
 def _know_picture(settings: GIMP3D_PG_settings, _: bpy.types.Context) -> None:
     """Called when the user or a script chooses a picture, and not for what a .blend brings along."""
-    from . import trust  # it needs this module
-
     if settings.reference_image:
         trust.know_photos([Path(bpy.path.abspath(settings.reference_image))])
 
@@ -139,64 +137,6 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
     last_report: StringProperty(
         name="Report", subtype="FILE_PATH", description="What each stage of the last removal did, as a web page"
     )
-
-
-def _make_absolute(preferences: GIMP3D_preferences, _: bpy.types.Context) -> None:
-    """The file browser may give a path from the .blend's folder: another .blend would name another Python by it."""
-    if preferences.python.startswith("//"):
-        preferences.python = bpy.path.abspath(preferences.python)
-
-
-class GIMP3D_preferences(bpy.types.AddonPreferences):
-    """Which Python runs the removal."""
-
-    bl_idname = __package__.rpartition(".")[0] or __package__  # the extension; in a checkout the add-on itself
-
-    python: StringProperty(
-        name="Python",
-        subtype="FILE_PATH",
-        description="An interpreter with numba, scipy and OpenCV; empty: Blender's own with what the extension brings",
-        update=_make_absolute,
-    )
-
-    def draw(self, context: bpy.types.Context) -> None:
-        from . import trust  # they need this module
-        from .operators.environment import USES, GIMP3D_OT_check, verdict
-
-        layout = self.layout
-        layout.label(text="Remove runs in a Python of its own, so that Blender stays free.")
-        layout.prop(self, "python")
-        row = layout.row()
-        row.operator("gimp3d.make_environment", icon="IMPORT")
-        row.operator("gimp3d.check", icon="CHECKMARK")
-        for name, version in GIMP3D_OT_check.found.items():
-            there = bool(version) and not version.startswith("broken")
-            words = (f"{name} {version or 'missing'}", USES.get(name, ""), verdict(name))
-            icon = "CHECKMARK" if there else "INFO" if name in USES else "ERROR"
-            layout.label(text=", ".join(w for w in words if w), icon=icon)
-        for number, said in enumerate(trust.allowed()):
-            row = layout.row()
-            column = row.column(align=True)
-            for line in said.splitlines():
-                column.label(text=line, icon="BLANK1" if line != said.splitlines()[0] else "CHECKBOX_HLT")
-            row.operator("gimp3d.forget_allowed", text="Ask Again").index = number
-
-
-CLASSES = (GIMP3D_PG_region, GIMP3D_PG_settings, GIMP3D_preferences)
-
-
-def preferences(context: bpy.types.Context) -> GIMP3D_preferences | None:
-    """The add-on's preferences; None where it was registered from a checkout without being enabled."""
-    addon = context.preferences.addons.get(GIMP3D_preferences.bl_idname)
-    return addon.preferences if addon else None
-
-
-def user_folder(name: str) -> Path:
-    """A folder of the add-on's own in Blender's user folder, which updates leave alone."""
-    package = GIMP3D_preferences.bl_idname
-    if package.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(package, path=name, create=True))
-    return Path(bpy.utils.user_resource("DATAFILES", path=f"gimp3d/{name}", create=True))
 
 
 def register() -> None:

@@ -23,22 +23,17 @@ from gimp3d.sh import sh_basis
 from gimp3d.srgb import decoded
 
 from .native import attribute_values, is_native, read_native, write_native
+from .shading import COLOUR, GROUP, RADIUS, node_group, splat_material
 
 T = TypeVar("T")
 TABLE = "gimp3d_ply"  # custom property of the mesh: header and format as JSON
 ID = "gimp3d_id"  # custom property of the object: the jobs that are about it know it by this
-COLOUR = "splat_color"  # a point's attribute named "color" is black in Cycles
 RAW = "ply:"  # prefix of the attributes that hold the file's numbers
-GROUP, MATERIAL, POINT_MATERIAL = "3D-GIMP splats", "3D-GIMP splat", "3D-GIMP point"
 DISPLAY = ("As Points", "Fraction")  # inputs of the node group
-EXTENT = 3.0  # standard deviations drawn
-RADIUS = "point_radius"  # attribute: of a splat shown as a point; 0 is not shown
 FAINT = 0.05  # opacity below which a splat is not shown as a point: points hide what lies behind them
 WIDE = 1.5  # standard deviations that a point covers
 LARGEST = 0.9  # quantile of the radii that no point exceeds: a few giants would hide the scene
-MANY = (
-    20_000  # from here on splats are shown as points unless the user asks otherwise: a scan's ellipsoids take minutes
-)
+MANY = 20_000  # from here on splats are shown as points unless the user asks otherwise: ellipsoids take minutes
 UP_AXES = {
     "FILE": Matrix.Identity(4),
     "Y_DOWN": Matrix.Rotation(np.radians(-90), 4, "X"),  # COLMAP's usual scenes: (x, y, z) → (x, z, −y)
@@ -89,14 +84,8 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
         _store_raw(mesh, prop, column)
     _store_display(mesh, gaussians, usable)
     table = file.table
-    mesh[TABLE] = json.dumps(
-        {
-            "header": _vertex_header(table.header),
-            "line_end": table.line_end,
-            "format": table.format,
-            "properties": [[p.name, p.type] for p in table.properties],
-        }
-    )
+    kept = {"header": _vertex_header(table.header), "line_end": table.line_end, "format": table.format}
+    mesh[TABLE] = json.dumps({**kept, "properties": [[p.name, p.type] for p in table.properties]})
     mesh.materials.append(splat_material())
     obj = bpy.data.objects.new(name, mesh)
     obj.matrix_world, obj[ID] = matrix, uuid.uuid4().hex
@@ -297,151 +286,6 @@ def point_radii(
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str, key: str, array: np.ndarray) -> None:
     attribute = mesh.attributes.new(name, kind, "POINT")
     attribute.data.foreach_set(key, np.ascontiguousarray(array).ravel())
-
-
-def node_group() -> bpy.types.NodeTree:
-    """Geometry nodes that put an ellipsoid, or in the viewport a point, on every splat; one group for all objects."""
-    if GROUP in bpy.data.node_groups:
-        return bpy.data.node_groups[GROUP]
-    tree = bpy.data.node_groups.new(GROUP, "GeometryNodeTree")
-    tree.is_modifier = True
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    points = tree.interface.new_socket("As Points", in_out="INPUT", socket_type="NodeSocketBool")
-    points.description = "Show points instead of ellipsoids in the viewport: fast for millions; renders are the same"
-    fraction = tree.interface.new_socket("Fraction", in_out="INPUT", socket_type="NodeSocketFloat")
-    fraction.default_value, fraction.min_value, fraction.max_value = 1.0, 0.0, 1.0
-    fraction.description = "Share of the splats to show"
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    node, link = tree.nodes.new, tree.links.new
-    source, target = node("NodeGroupInput"), node("NodeGroupOutput")
-    lottery = node("FunctionNodeRandomValue")
-    lottery.data_type = "FLOAT"
-    chosen = node("FunctionNodeCompare")
-    chosen.data_type, chosen.operation = "FLOAT", "LESS_EQUAL"
-    link(lottery.outputs["Value"], chosen.inputs["A"])
-    link(source.outputs["Fraction"], chosen.inputs["B"])
-
-    ball = node("GeometryNodeMeshIcoSphere")
-    ball.inputs["Radius"].default_value, ball.inputs["Subdivisions"].default_value = 1.0, 2
-    painted = node("GeometryNodeSetMaterial")
-    painted.inputs["Material"].default_value = splat_material()
-    link(ball.outputs["Mesh"], painted.inputs["Geometry"])
-    instances = node("GeometryNodeInstanceOnPoints")
-    link(source.outputs["Geometry"], instances.inputs["Points"])
-    link(chosen.outputs["Result"], instances.inputs["Selection"])
-    link(painted.outputs["Geometry"], instances.inputs["Instance"])
-    link(_named(tree, "rotation", "QUATERNION"), instances.inputs["Rotation"])
-    extent = node("ShaderNodeVectorMath")
-    extent.operation = "SCALE"
-    extent.inputs["Scale"].default_value = EXTENT
-    link(_named(tree, "scale", "FLOAT_VECTOR"), extent.inputs[0])
-    link(extent.outputs[0], instances.inputs["Scale"])
-
-    dots, radius = node("GeometryNodeMeshToPoints"), _named(tree, RADIUS, "FLOAT")
-    there, drawn = node("FunctionNodeCompare"), node("FunctionNodeBooleanMath")
-    there.data_type, there.operation, there.inputs["B"].default_value = "FLOAT", "GREATER_THAN", 0.0
-    drawn.operation = "AND"
-    link(radius, there.inputs["A"])
-    link(chosen.outputs["Result"], drawn.inputs[0])
-    link(there.outputs["Result"], drawn.inputs[1])
-    link(source.outputs["Geometry"], dots.inputs["Mesh"])
-    link(drawn.outputs[0], dots.inputs["Selection"])
-    link(radius, dots.inputs["Radius"])
-    coloured = node("GeometryNodeSetMaterial")
-    coloured.inputs["Material"].default_value = point_material()
-    link(dots.outputs["Points"], coloured.inputs["Geometry"])
-
-    choice, both = node("GeometryNodeSwitch"), node("FunctionNodeBooleanMath")
-    choice.input_type, both.operation = "GEOMETRY", "AND"
-    link(source.outputs["As Points"], both.inputs[0])
-    link(node("GeometryNodeIsViewport").outputs[0], both.inputs[1])
-    link(both.outputs[0], choice.inputs["Switch"])
-    link(instances.outputs["Instances"], choice.inputs["False"])
-    link(coloured.outputs["Geometry"], choice.inputs["True"])
-    link(choice.outputs["Output"], target.inputs["Geometry"])
-    return tree
-
-
-def _named(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
-    node = tree.nodes.new("GeometryNodeInputNamedAttribute")
-    node.data_type = kind
-    node.inputs["Name"].default_value = name
-    return node.outputs["Attribute"]
-
-
-def splat_material() -> bpy.types.Material:
-    """Emission of a splat's colour with falloff: opacity · exp(−d²/2), d the ray's distance to the centre."""
-    if MATERIAL in bpy.data.materials:
-        return bpy.data.materials[MATERIAL]
-    material = _blank_material(MATERIAL)
-    material.surface_render_method = "BLENDED"
-    tree = material.node_tree
-    node, link = tree.nodes.new, tree.links.new
-
-    def math(operation: str, a: object, b: object = None) -> bpy.types.NodeSocket:
-        step = node("ShaderNodeMath")
-        step.operation = operation
-        for socket, value in zip(step.inputs, (a, b)):
-            if isinstance(value, bpy.types.NodeSocket):
-                link(value, socket)
-            elif value is not None:
-                socket.default_value = value
-        return step.outputs[0]
-
-    def dot(a: bpy.types.NodeSocket, b: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        product = node("ShaderNodeVectorMath")
-        product.operation = "DOT_PRODUCT"
-        link(a, product.inputs[0])
-        link(b, product.inputs[1])
-        return product.outputs["Value"]
-
-    colour, opacity = (node("ShaderNodeAttribute") for _ in range(2))
-    for attribute, name in ((colour, COLOUR), (opacity, "opacity")):
-        attribute.attribute_type, attribute.attribute_name = "INSTANCER", name
-    geometry, place = node("ShaderNodeNewGeometry"), node("ShaderNodeTexCoord")
-    to_object, ray = node("ShaderNodeVectorTransform"), node("ShaderNodeVectorMath")
-    to_object.vector_type, to_object.convert_from, to_object.convert_to = "VECTOR", "WORLD", "OBJECT"
-    ray.operation = "NORMALIZE"
-    link(geometry.outputs["Incoming"], to_object.inputs[0])
-    link(to_object.outputs[0], ray.inputs[0])
-    along = dot(place.outputs["Object"], ray.outputs[0])
-    distance = math("SUBTRACT", dot(place.outputs["Object"], place.outputs["Object"]), math("MULTIPLY", along, along))
-    falloff = math("EXPONENT", math("MULTIPLY", distance, -0.5 * EXTENT**2))
-    front = math("SUBTRACT", 1.0, geometry.outputs["Backfacing"])
-    alpha = math("MULTIPLY", math("MULTIPLY", falloff, opacity.outputs["Fac"]), front)
-    emission, clear, mix = (
-        node("ShaderNodeEmission"),
-        node("ShaderNodeBsdfTransparent"),
-        node("ShaderNodeMixShader"),
-    )
-    out = node("ShaderNodeOutputMaterial")
-    link(colour.outputs["Color"], emission.inputs["Color"])
-    link(alpha, mix.inputs["Fac"])
-    link(clear.outputs[0], mix.inputs[1])
-    link(emission.outputs[0], mix.inputs[2])
-    link(mix.outputs[0], out.inputs["Surface"])
-    return material
-
-
-def point_material() -> bpy.types.Material:
-    """Opaque emission of a point's colour. A point is no instance, so it carries its colour itself."""
-    if POINT_MATERIAL in bpy.data.materials:
-        return bpy.data.materials[POINT_MATERIAL]
-    material = _blank_material(POINT_MATERIAL)
-    node, link = material.node_tree.nodes.new, material.node_tree.links.new
-    colour, emission, out = node("ShaderNodeAttribute"), node("ShaderNodeEmission"), node("ShaderNodeOutputMaterial")
-    colour.attribute_type, colour.attribute_name = "GEOMETRY", COLOUR
-    link(colour.outputs["Color"], emission.inputs["Color"])
-    link(emission.outputs[0], out.inputs["Surface"])
-    return material
-
-
-def _blank_material(name: str) -> bpy.types.Material:
-    material = bpy.data.materials.new(name)
-    if material.node_tree is None:  # Blender < 5.0
-        material.use_nodes = True
-    material.node_tree.nodes.clear()
-    return material
 
 
 def default_name(path: Path) -> str:

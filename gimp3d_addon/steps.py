@@ -13,8 +13,7 @@ from gimp3d.errors import BadInput
 from gimp3d.forecast import Forecast, forecast_removal
 
 from . import bridge, splats
-from .bridge import present
-from .operators.base import current_boxes, current_splat
+from .chosen import current_boxes, current_splat, present
 
 FEW_VIEWS = 3  # below it hardly anything behind the object is seen
 
@@ -111,10 +110,7 @@ def forecast(context: bpy.types.Context) -> Forecast | None:
     return forecast_removal(splats.count(splat), len(views), pixels, context.scene.gimp3d.preset)
 
 
-_inside: tuple[tuple[Any, ...], int] = (
-    (),
-    0,
-)  # the last count and what it was of: a panel is drawn many times a second
+_inside: tuple[tuple[Any, ...], int] = ((), 0)  # what was counted last: a panel is drawn many times a second
 
 
 def splats_inside(splat: bpy.types.Object, boxes: list[bpy.types.Object]) -> int:

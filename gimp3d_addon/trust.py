@@ -15,7 +15,7 @@ from typing import Any
 from gimp3d.io.cameras import PHOTOS
 from gimp3d.job import write_atomically
 
-from .properties import user_folder
+from .installation import user_folder
 
 ALLOWED, PHOTO_FOLDERS = "allowed.json", "photos.json"
 
@@ -69,11 +69,8 @@ def know_photos(photos: Iterable[Path]) -> None:
 def is_known_photo(path: Path) -> bool:
     """Whether a file is named as a picture and lies, links followed, in a folder that the user took pictures from."""
     known = _read(PHOTO_FOLDERS)
-    if (
-        path.suffix.lower() not in PHOTOS or str(path.absolute().parent) not in known
-    ):  # before the disk, or a network, is asked
-        return False
-    return str(path.resolve().parent) in known and path.is_file()
+    named = path.suffix.lower() in PHOTOS and str(path.absolute().parent) in known  # no disk or network is asked yet
+    return named and str(path.resolve().parent) in known and path.is_file()
 
 
 _last: dict[str, tuple[int, list[str]]] = {}  # a panel asks many times a second

@@ -29,10 +29,22 @@ class Box:
     def make(cls, center: object, size: object, rotation_wxyz: object = (1, 0, 0, 0)) -> Box:
         """A checked box from anything array-like.
 
+        Parameters
+        ----------
+        center, size
+            Three numbers each, in scene units; the size is the length of the edges.
+        rotation_wxyz
+            A quaternion of any length but zero: how the box is turned.
+
         Raises
         ------
         BadInput
             If a number is missing, not finite, a size is not positive or the quaternion is zero.
+
+        Examples
+        --------
+        >>> Box.make([0, 0, 0.5], [1, 1, 1]).contains(np.array([[0, 0, 0.9], [0, 0, 1.1]]))
+        array([ True, False])
         """
         try:
             c, s, q = (np.array(v, dtype=np.float64) for v in (center, size, rotation_wxyz))

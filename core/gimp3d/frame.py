@@ -84,7 +84,16 @@ FILES = Frame(np.zeros(3), 1.0)
 
 
 def frame_of(file: SplatFile, cameras: Sequence[Camera]) -> Frame:
-    """The frame that suits a scene as these cameras see it."""
+    """The frame that suits a scene as these cameras see it: near the origin and of ordinary size.
+
+    Most scenes are so already, and keep theirs.
+
+    Examples
+    --------
+    >>> file, cameras = read_ply("scene.ply"), read_cameras("transforms.json")
+    >>> frame_of(file, cameras).scale
+    1.0
+    """
     usable = np.flatnonzero(file.gaussians.usable)
     points = positions(file)[usable[:: len(usable) // SAMPLED + 1]]
     depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]

@@ -31,10 +31,23 @@ def orbit_cameras(
 ) -> tuple[Camera, ...]:
     """Cameras that look at a region's centre from rings above it, IDs orbit/000, orbit/001 …
 
+    Parameters
+    ----------
+    up
+        A direction in the scene, of any length; the rings stand round it.
+    width, height
+        Of the pictures, pixels.
+
     Raises
     ------
     BadInput
         If the up direction is zero, the region is empty, or a count, size or angle makes no sense.
+
+    Examples
+    --------
+    >>> cameras = orbit_cameras([Box.make([0, 0, 0.5], [1, 1, 1])], count=6, width=60, height=45)
+    >>> [camera.id for camera in cameras][:2]
+    ['orbit/000', 'orbit/001']
     """
     axis = np.asarray(up, dtype=np.float64)
     if axis.shape != (3,) or not np.isfinite(axis).all() or np.linalg.norm(axis) < 1e-9:

@@ -50,7 +50,7 @@ def remove_object(
     allow_network: bool = False,  # whether providers may send pictures off this machine
     observer: Observer = unobserved,  # runs each stage: to watch it, or to replace it
 ) -> RemovalResult:
-    """Remove what lies in the region and fill what it hid (the paper's pipeline; docs/method.md).
+    """Remove what lies in the region and fill what it hid: the stages of docs/method.md, in their order.
 
     Parameters
     ----------
@@ -61,12 +61,25 @@ def remove_object(
     reference_image
         What the reference looks like without the object; None fills it by `settings.inpaint`.
 
+    Returns
+    -------
+    RemovalResult
+        `keep` [N] bool over the scene's rows, `added` new Gaussians (or None); and what each stage says of itself.
+
     Raises
     ------
     BadInput
         If a provider cannot be used, or the chart that is named does not exist.
     IllPosed
         If the task has no defined answer, with the reason.
+
+    Examples
+    --------
+    >>> file, region = read_ply("scene.ply"), (Box.make([0, 0, 0.26], [0.62, 0.62, 0.56]),)
+    >>> views = [View(c, load_view(c)[0]) for c in read_cameras("transforms.json")]
+    >>> result = remove_object(file.gaussians, views, region, PRESETS["draft"])
+    >>> bool(result.keep.all()), len(result.added) > 0
+    (False, True)
     """
     run = Run(settings, progress, store, allow_network, observer)
     for notice in provider_notices(settings, allow_network):

@@ -6,17 +6,18 @@ A failure is one line to the user, CANCELLED to the caller (a RuntimeError in sc
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 from bpy.props import BoolProperty, IntProperty
 
 from gimp3d.errors import BadInput, Gimp3dError
 
-from .. import splats, trust
-from ..bridge import present
-from ..properties import preferences
+from .. import trust
+from ..chosen import current_boxes, current_splat
+from ..installation import preferences
 from ..worker import Worker
 
 FAILURES = (Gimp3dError, OSError)  # what a user can act on; anything else is a bug and keeps its traceback
@@ -31,7 +32,32 @@ def one_line(error: Exception) -> str:
     return f"gimp3d: error: {text}"
 
 
-class ReportsErrors:
+class Need(NamedTuple):
+    """What has to be there before an operator can be called."""
+
+    words: str  # what to do if it is not
+    is_there: Callable[[bpy.types.Context], Any]
+
+
+SPLAT = Need("Step 1: import a splat scene", lambda context: current_splat(context) is not None)
+BOX = Need("Step 2: put a box round the object", lambda context: current_boxes(context))
+CAMERA = Need("Make a camera active first", lambda context: context.scene.camera is not None)
+
+
+class Needs:
+    """Mixin: the operator's button is grey until all that it needs is there, and says what is not."""
+
+    needs: tuple[Need, ...] = ()
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        missing = next((need for need in cls.needs if not need.is_there(context)), None)
+        if missing is not None:
+            cls.poll_message_set(missing.words)
+        return missing is None
+
+
+class ReportsErrors(Needs):
     """Mixin: `execute` runs `work` and reports a failure as one line."""
 
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -43,7 +69,13 @@ class ReportsErrors:
         return {"FINISHED"}
 
 
-class RunsChild:
+class Edits(ReportsErrors):
+    """Mixin: changes the scene at once, and may be undone."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+
+class RunsChild(Needs):
     """Mixin: `start` prepares files and starts a child, `collect` takes its result, beside a Blender that stays free.
 
     `execute` (scripts, background) waits for the end. In the window Esc or the panel's button cancels at once.
@@ -218,16 +250,12 @@ class AsksFirst(RunsChild):
         return super().execute(context)
 
 
-class GIMP3D_OT_cancel(bpy.types.Operator):
+class GIMP3D_OT_cancel(Needs, bpy.types.Operator):
     """Stop what is running now; the scene stays as it was"""
 
     bl_idname = "gimp3d.cancel"
     bl_label = "Cancel"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Nothing is running")
-        return RunsChild.running is not None
+    needs = (Need("Nothing is running", lambda _: RunsChild.running is not None),)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         RunsChild.running.worker.cancel()
@@ -241,26 +269,6 @@ def redraw_panels(context: bpy.types.Context) -> None:
             for region in area.regions:
                 if region.type == "UI":
                     region.tag_redraw()
-
-
-def current_splat(context: bpy.types.Context) -> bpy.types.Object | None:
-    """The chosen splat object, else the active one, else the only one."""
-    settings = context.scene.gimp3d
-    if splats.is_splat(present(context.scene, settings.splat)):
-        return settings.splat
-    if splats.is_splat(context.active_object):
-        return context.active_object
-    found = [o for o in context.scene.objects if splats.is_splat(o) and not o.hide_get()]
-    return found[0] if len(found) == 1 else None
-
-
-def current_boxes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The region's boxes: the listed ones, else the active mesh that is no splat."""
-    listed = [r.object for r in context.scene.gimp3d.rois if present(context.scene, r.object)]
-    active = context.active_object
-    if not listed and active is not None and active.type == "MESH" and not splats.is_splat(active):
-        return [active]
-    return listed
 
 
 def link(context: bpy.types.Context, obj: bpy.types.Object, collection: bpy.types.Collection | None = None) -> None:
@@ -301,9 +309,6 @@ class GIMP3D_OT_forget_allowed(bpy.types.Operator):
         for said in trust.allowed()[self.index : self.index + 1]:
             trust.forget(said)
         return {"FINISHED"}
-
-
-CLASSES = (GIMP3D_OT_cancel, GIMP3D_OT_forget_allowed)
 
 
 def light_words(shadow: dict[str, Any], reflection: dict[str, Any]) -> str:

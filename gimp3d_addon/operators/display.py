@@ -9,8 +9,9 @@ from mathutils import Vector
 from gimp3d.errors import BadInput
 
 from .. import bridge, splats
+from ..chosen import current_splat
 from ..native import is_native
-from .base import ReportsErrors, current_splat
+from .base import CAMERA, SPLAT, Edits, Need
 
 BOUNCES = 256  # transparent surfaces that a ray passes; with Blender's 8 crowded splats turn dark
 MOST = 10  # percent of the splats, at either end of each axis, that need not be in view after an import
@@ -38,18 +39,16 @@ def show_in(view: bpy.types.SpaceView3D, obj: bpy.types.Object) -> None:
     view.clip_start, view.clip_end = min(view.clip_start, 1e-3 * size), max(view.clip_end, 100 * size)
 
 
-class GIMP3D_OT_update_colours(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_update_colours(Edits, bpy.types.Operator):
     """Colour the splats as they look from the active camera: shine and reflections depend on where one stands"""
 
     bl_idname = "gimp3d.update_colours"
     bl_label = "Colours from Camera"
-    bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene and make a camera active first")
-        splat = current_splat(context)
-        return splat is not None and not is_native(splat) and context.scene.camera is not None
+    needs = (
+        SPLAT,
+        CAMERA,
+        Need("Blender colours its own splats", lambda context: not is_native(current_splat(context))),
+    )
 
     def work(self, context: bpy.types.Context) -> None:
         splat, camera = current_splat(context), context.scene.camera
@@ -70,12 +69,11 @@ def unfit_settings(scene: bpy.types.Scene) -> list[str]:
     return found
 
 
-class GIMP3D_OT_prepare_render(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_prepare_render(Edits, bpy.types.Operator):
     """Let renders show the splats' true colours: 256 transparent bounces in Cycles, view transform Standard"""
 
     bl_idname = "gimp3d.prepare_render"
     bl_label = "Set Up Render"
-    bl_options = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
         scene = context.scene
@@ -84,23 +82,15 @@ class GIMP3D_OT_prepare_render(ReportsErrors, bpy.types.Operator):
             scene.cycles.transparent_max_bounces = max(BOUNCES, scene.cycles.transparent_max_bounces)
 
 
-class GIMP3D_OT_even_scale(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_even_scale(Edits, bpy.types.Operator):
     """Give the splat object the same scale on all axes: splats cannot be stretched or mirrored"""
 
     bl_idname = "gimp3d.even_scale"
     bl_label = "Make Scale Even"
-    bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Step 1: import a splat scene")
-        return current_splat(context) is not None
+    needs = (SPLAT,)
 
     def work(self, context: bpy.types.Context) -> None:
         splat = current_splat(context)
         splat.scale = (max(1e-6, sum(map(abs, splat.scale)) / 3),) * 3
         context.view_layer.update()
         bridge.splat_frame(splat)  # a parent may still stretch it
-
-
-CLASSES = (GIMP3D_OT_update_colours, GIMP3D_OT_prepare_render, GIMP3D_OT_even_scale)

@@ -13,9 +13,9 @@ import bpy
 
 from gimp3d.errors import BadInput
 
-from ..properties import preferences, user_folder
+from ..installation import preferences, user_folder
 from ..worker import Worker, core_folder, own_python
-from .base import RunsChild, python_of, redraw_panels
+from .base import Need, RunsChild, python_of, redraw_panels
 
 LOCK = Path(__file__).resolve().parents[1] / "wheels.txt"  # versions and SHA-256 of the files that are installed
 SIZE = "about 190 MB to download, 650 MB on disk"  # on Linux: tools/lock_wheels.py --size measures it
@@ -79,11 +79,10 @@ class GIMP3D_OT_make_environment(RunsChild, bpy.types.Operator):
 
     bl_idname = "gimp3d.make_environment"
     bl_label = "Make Environment"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Enable the extension first")
-        return preferences(context) is not None and RunsChild.running is None
+    needs = (
+        Need("Enable the extension first", lambda context: preferences(context) is not None),
+        Need("Wait until what is running has ended", lambda _: RunsChild.running is None),
+    )
 
     def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self, width=420, confirm_text="Download and Install")
@@ -149,6 +148,3 @@ def verdict(name: str) -> str:
         return "the tested file, its SHA-256 checked when it was installed"
     # OpenCV's module does not say the last part of its package's version
     return "the tested version" if tested == version or tested.startswith(f"{version}.") else f"tested with {tested}"
-
-
-CLASSES = (GIMP3D_OT_make_environment, GIMP3D_OT_check)

@@ -9,12 +9,12 @@ import numpy as np
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from gimp3d.errors import BadInput
 from gimp3d.io.formats import read_scene
 from gimp3d.io.ply import write_ply
 
 from .. import jobs, splats
-from .base import ReportsErrors, current_splat, link, select_only
+from ..chosen import current_splat
+from .base import SPLAT, Edits, ReportsErrors, link, select_only
 from .display import show_imported
 
 UP_ITEMS = (
@@ -24,12 +24,11 @@ UP_ITEMS = (
 )
 
 
-class GIMP3D_OT_import_ply(ReportsErrors, bpy.types.Operator, ImportHelper):
+class GIMP3D_OT_import_ply(Edits, bpy.types.Operator, ImportHelper):
     """Import a Gaussian splat scene; its numbers are kept exactly"""
 
     bl_idname = "gimp3d.import_ply"
     bl_label = "Import Splats"
-    bl_options = {"REGISTER", "UNDO"}
     filename_ext = ".ply"
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})  # a dropped file must not be the next default
@@ -62,21 +61,14 @@ class GIMP3D_OT_export_ply(ReportsErrors, bpy.types.Operator, ExportHelper):
 
     bl_idname = "gimp3d.export_ply"
     bl_label = "Export Splat PLY"
+    needs = (SPLAT,)
     filename_ext = ".ply"
 
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Select a splat object, or import one")
-        return current_splat(context) is not None
-
     def work(self, context: bpy.types.Context) -> None:
         active = context.active_object
-        obj = active if splats.is_splat(active) else current_splat(context)
-        if obj is None:
-            raise BadInput("no splat object to export")
-        file = splats.read_object(obj)
+        file = splats.read_object(active if splats.is_splat(active) else current_splat(context))
         write_ply(Path(bpy.path.abspath(self.filepath)), file, np.ones(len(file.gaussians), bool))
 
 
@@ -99,9 +91,6 @@ def _menu_import(self: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 def _menu_export(self: bpy.types.Menu, context: bpy.types.Context) -> None:
     self.layout.operator(GIMP3D_OT_export_ply.bl_idname, text="Gaussian Splats, 3D-GIMP (.ply)")
-
-
-CLASSES = (GIMP3D_OT_import_ply, GIMP3D_OT_export_ply, GIMP3D_FH_splats)
 
 
 def register() -> None:

@@ -19,15 +19,16 @@ from gimp3d.io.ply import write_ply
 from gimp3d.job import RemovalJob
 
 from .. import backdrops, bridge, charts, jobs, splats
+from ..chosen import current_splat, present
 from ..worker import Worker
-from .base import FAILURES, AsksFirst, ReportsErrors, RunsChild, current_boxes, current_splat, light_words, python_of
+from .base import BOX, CAMERA, FAILURES, SPLAT, AsksFirst, Edits, RunsChild, light_words, python_of
 
 PREVIEWS = {"mask": "hole", "depth": "surface", "fit": "depth prior", "shadow": "shadow"}
 VIEW = "view"  # ID of the one camera that is drawn
 
 
 def _camera(context: bpy.types.Context) -> bpy.types.Object:
-    found = bridge.present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
+    found = present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
     if found is None:
         raise BadInput("no camera; choose a reference view or set the scene's active camera")
     return found
@@ -59,6 +60,8 @@ class RunsInPassing(RunsChild):
 
 class Looks(AsksFirst, RunsInPassing):
     """Mixin: shows what would be filled, for which the surface is completed."""
+
+    needs = (SPLAT, BOX)
 
     def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
         return (context.scene.gimp3d.depth_prior,)
@@ -99,26 +102,35 @@ def _look(context: bpy.types.Context, camera: bpy.types.Object, folder: Path) ->
     return Worker(arguments, python_of(context)), output_name(job.reference)
 
 
-class GIMP3D_OT_render_view(RunsInPassing, bpy.types.Operator):
+class DrawsView(RunsInPassing):
+    """Mixin: draws the splats as they really look from one camera; `take` gets the picture."""
+
+    def start(self, context: bpy.types.Context) -> Worker:
+        camera = self.camera(context)
+        self._camera = camera.name
+        return _draw(context, camera, self.new_folder())
+
+    def collect(self, context: bpy.types.Context) -> None:
+        self.worker.result()
+        self.take(context, Path(self._folder.name, f"{VIEW}.png"))
+
+    def camera(self, context: bpy.types.Context) -> bpy.types.Object:
+        return context.scene.camera
+
+    def take(self, context: bpy.types.Context, picture: Path) -> None:
+        raise NotImplementedError
+
+
+class GIMP3D_OT_render_view(DrawsView, bpy.types.Operator):
     """Draw the splats as they really look from the active camera: over its view and in the image '3D-GIMP view'"""
 
     bl_idname = "gimp3d.render_view"
     bl_label = "Show True Picture"
     bl_options = {"UNDO"}
+    needs = (SPLAT, CAMERA)
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene and make a camera active first")
-        return current_splat(context) is not None and context.scene.camera is not None
-
-    def start(self, context: bpy.types.Context) -> Worker:
-        self._camera = context.scene.camera.name
-        return _draw(context, context.scene.camera, self.new_folder())
-
-    def collect(self, context: bpy.types.Context) -> None:
-        self.worker.result()
-        image = backdrops.load_picture(Path(self._folder.name, f"{VIEW}.png"), VIEW)
-        _show(context, self._camera, image)
+    def take(self, context: bpy.types.Context, picture: Path) -> None:
+        _show(context, self._camera, backdrops.load_picture(picture, VIEW))
 
 
 def _show(context: bpy.types.Context, camera: str, image: bpy.types.Image) -> None:
@@ -134,11 +146,6 @@ class GIMP3D_OT_preview_masks(Looks, bpy.types.Operator):
     bl_idname = "gimp3d.preview_masks"
     bl_label = "Preview Mask"
     bl_options = {"UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene and put a box round the object first")
-        return current_splat(context) is not None and bool(current_boxes(context))
 
     def start(self, context: bpy.types.Context) -> Worker:
         camera = _view(context)
@@ -166,12 +173,11 @@ class GIMP3D_OT_preview_masks(Looks, bpy.types.Operator):
             charts.show(context, folder / "pictures" / "charts", current_splat(context))
 
 
-class GIMP3D_OT_hide_previews(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_hide_previews(Edits, bpy.types.Operator):
     """Take the previews and true pictures off all cameras; photos stay"""
 
     bl_idname = "gimp3d.hide_previews"
     bl_label = "Hide Previews"
-    bl_options = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
         for obj in context.scene.objects:
@@ -179,12 +185,11 @@ class GIMP3D_OT_hide_previews(ReportsErrors, bpy.types.Operator):
                 backdrops.take_away(obj)
 
 
-class GIMP3D_OT_choose_reference(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_choose_reference(Edits, bpy.types.Operator):
     """Make the active camera (or camera object) the reference view; without one the program chooses"""
 
     bl_idname = "gimp3d.choose_reference"
     bl_label = "Use This Camera"
-    bl_options = {"REGISTER", "UNDO"}
 
     camera: StringProperty(name="Camera", description="Name of a camera object; empty: the selected or active one")
 
@@ -207,13 +212,8 @@ class RunsReference(Looks):
 
     _drawing = False
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene and put a box round the object first")
-        return current_splat(context) is not None and bool(current_boxes(context))
-
     def execute(self, context: bpy.types.Context) -> set[str]:
-        chart = bridge.present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
+        chart = present(context.scene, context.scene.gimp3d.reference) or context.scene.camera
         if not bridge.is_chart(chart):
             return super().execute(context)
         try:
@@ -280,28 +280,22 @@ class GIMP3D_OT_paint_reference(RunsReference, bpy.types.Operator):
         backdrops.show_in_image_editor(context, image)
 
 
-class GIMP3D_OT_paint_shadow(RunsInPassing, bpy.types.Operator):
+class GIMP3D_OT_paint_shadow(DrawsView, bpy.types.Operator):
     """Put the view into the image '3D-GIMP shadow paint': paint over the shadow, in any colour, and it is undone"""
 
     bl_idname = "gimp3d.paint_shadow"
     bl_label = "Paint Shadow"
     bl_options = {"UNDO"}
+    needs = (SPLAT,)
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Import a splat scene first")
-        return current_splat(context) is not None
-
-    def start(self, context: bpy.types.Context) -> Worker:
+    def camera(self, context: bpy.types.Context) -> bpy.types.Object:
         camera = _view(context)
         if not bridge.is_view(context.scene, camera):
             raise BadInput(f"camera {camera.name} is not among the views")
-        self._camera = camera.name
-        return _draw(context, camera, self.new_folder())
+        return camera
 
-    def collect(self, context: bpy.types.Context) -> None:
-        self.worker.result()
-        picture, settings = Path(self._folder.name, f"{VIEW}.png"), context.scene.gimp3d
+    def take(self, context: bpy.types.Context, picture: Path) -> None:
+        settings = context.scene.gimp3d
         backdrops.load_picture(picture, jobs.SHADOW_BEFORE)
         image = backdrops.load_picture(picture, "shadow paint")
         settings.shadow, settings.shadow_paint = "mask", image
@@ -309,12 +303,11 @@ class GIMP3D_OT_paint_shadow(RunsInPassing, bpy.types.Operator):
         backdrops.show_in_image_editor(context, image)
 
 
-class GIMP3D_OT_load_reference(ReportsErrors, bpy.types.Operator, ImportHelper):
+class GIMP3D_OT_load_reference(Edits, bpy.types.Operator, ImportHelper):
     """Use a picture of the reference view without the object"""
 
     bl_idname = "gimp3d.load_reference"
     bl_label = "Load Reference"
-    bl_options = {"REGISTER", "UNDO"}
 
     filter_glob: StringProperty(default="*.png;*.jpg;*.jpeg;*.tif;*.tiff;*.webp", options={"HIDDEN"})
 
@@ -324,15 +317,3 @@ class GIMP3D_OT_load_reference(ReportsErrors, bpy.types.Operator, ImportHelper):
             raise BadInput(f"the picture {path} does not exist")
         settings = context.scene.gimp3d
         settings.reference, settings.reference_image, settings.reference_paint = _camera(context), str(path), None
-
-
-CLASSES = (
-    GIMP3D_OT_render_view,
-    GIMP3D_OT_preview_masks,
-    GIMP3D_OT_hide_previews,
-    GIMP3D_OT_choose_reference,
-    GIMP3D_OT_export_reference,
-    GIMP3D_OT_paint_reference,
-    GIMP3D_OT_load_reference,
-    GIMP3D_OT_paint_shadow,
-)

@@ -15,16 +15,18 @@ from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
 
 from .. import charts, jobs, splats, steps
-from ..bridge import present
+from ..chosen import current_boxes, current_splat, present
 from ..lock import is_held
 from ..worker import Killed, Worker, duration
 from .base import (
+    BOX,
     FAILURES,
+    SPLAT,
     AsksFirst,
+    Edits,
+    Need,
     ReportsErrors,
     RunsChild,
-    current_boxes,
-    current_splat,
     light_words,
     link,
     python_of,
@@ -86,21 +88,10 @@ class GIMP3D_OT_remove_object(RunsRemoval, bpy.types.Operator):
     bl_idname = "gimp3d.remove_object"
     bl_label = "Remove Object"
     bl_options = {"UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if current_splat(context) is None:
-            cls.poll_message_set("Step 1: import a splat scene")
-            return False
-        if not current_boxes(context):
-            cls.poll_message_set("Step 2: put a box round the object")
-            return False
-        return True
+    needs = (SPLAT, BOX)
 
     def start(self, context: bpy.types.Context) -> Worker:
         splat = current_splat(context)
-        if splat is None:
-            raise BadInput("no splat object; import a PLY first (3D-GIMP panel, step 1)")
         python_of(context)  # before anything is written
         self.folder = jobs.new_job_folder(splat.name)
         try:
@@ -115,8 +106,7 @@ class GIMP3D_OT_remove_object(RunsRemoval, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         """A box without splats is a slip, and waiting for a result that is the scene again helps nobody."""
         try:
-            splat, boxes = current_splat(context), current_boxes(context)
-            if splat is not None and boxes and steps.splats_inside(splat, boxes) == 0:
+            if steps.splats_inside(current_splat(context), current_boxes(context)) == 0:
                 self.report({"WARNING"}, "the box holds no splat: nothing to remove")
                 return {"CANCELLED"}
         except FAILURES as error:
@@ -130,11 +120,12 @@ class GIMP3D_OT_resume(RunsRemoval, bpy.types.Operator):
     bl_idname = "gimp3d.resume"
     bl_label = "Resume"
     bl_options = {"UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("No removal was stopped half-way")
-        return RunsChild.running is None and jobs.unfinished(context) is not None
+    needs = (
+        Need(
+            "No removal was stopped half-way",
+            lambda context: RunsChild.running is None and jobs.unfinished(context) is not None,
+        ),
+    )
 
     def providers(self, context: bpy.types.Context) -> tuple[str, ...]:
         """The job's own, which may not be the scene's any more."""
@@ -187,39 +178,32 @@ def source_in(context: bpy.types.Context) -> bpy.types.Object | None:
     return present(context.scene, source) if isinstance(source, bpy.types.Object) else None
 
 
-class OnResult:
-    """Mixin: for the object that a removal made."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Nothing was removed from this splat object")
-        return source_in(context) is not None
+RESULT = Need("Nothing was removed from this splat object", lambda context: source_in(context) is not None)
 
 
-class GIMP3D_OT_compare(OnResult, bpy.types.Operator):
+class GIMP3D_OT_compare(Edits, bpy.types.Operator):
     """Switch between the scene before and after the removal"""
 
     bl_idname = "gimp3d.compare"
     bl_label = "Before / After"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (RESULT,)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> None:
         result, source = current_splat(context), source_in(context)
         before = source.hide_render
         context.scene.gimp3d.splat = result
         _hide(context, source, not before)
         _hide(context, result, before)
-        return {"FINISHED"}
 
 
-class GIMP3D_OT_restore(OnResult, bpy.types.Operator):
+class GIMP3D_OT_restore(Edits, bpy.types.Operator):
     """Show the original scene again and take the result away"""
 
     bl_idname = "gimp3d.restore"
     bl_label = "Restore"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (RESULT,)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def work(self, context: bpy.types.Context) -> None:
         result, source = current_splat(context), source_in(context)
         _hide(context, source, False)
         context.scene.gimp3d.splat = source
@@ -227,7 +211,6 @@ class GIMP3D_OT_restore(OnResult, bpy.types.Operator):
         bpy.data.objects.remove(result)
         if data.users == 0:
             bpy.data.batch_remove([data])
-        return {"FINISHED"}
 
 
 class GIMP3D_OT_delete_jobs(ReportsErrors, bpy.types.Operator):
@@ -259,12 +242,3 @@ class GIMP3D_OT_delete_jobs(ReportsErrors, bpy.types.Operator):
         freed = (before - jobs.size(known)) / 1e6
         self.report({"INFO"}, f"{len(chosen)} jobs deleted, {freed:,.0f} MB freed")
         redraw_panels(context)
-
-
-CLASSES = (
-    GIMP3D_OT_remove_object,
-    GIMP3D_OT_resume,
-    GIMP3D_OT_compare,
-    GIMP3D_OT_restore,
-    GIMP3D_OT_delete_jobs,
-)

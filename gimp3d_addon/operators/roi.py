@@ -13,7 +13,8 @@ from gimp3d.box import Box
 from gimp3d.errors import BadInput
 
 from .. import bridge, splats
-from .base import ReportsErrors, current_boxes, current_splat, link, select_only
+from ..chosen import current_boxes, current_splat
+from .base import SPLAT, Edits, link, select_only
 
 FITS = (
     ("CURSOR", "At the 3D Cursor", "A cube at the 3D cursor (Shift + right click places it)", "PIVOT_CURSOR", 0),
@@ -25,22 +26,17 @@ MARGIN = 1.05  # of a box round a selection
 VIEW_SHARE = 1 / 3  # of the view's height that a box in the view takes
 
 
-class GIMP3D_OT_add_roi(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_add_roi(Edits, bpy.types.Operator):
     """Add a box for the object to remove; move, rotate and scale it round the object. Several boxes count together"""
 
     bl_idname = "gimp3d.add_roi"
     bl_label = "Add Box"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (SPLAT,)
 
     fit: EnumProperty(items=FITS, name="Fit", default="CURSOR", description="Where the box is put and how large it is")
     size: FloatProperty(
         name="Size", default=0.0, min=0.0, description="Edge length; 0: fitted, or a fifth of the scene"
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Step 1: import a splat scene")
-        return current_splat(context) is not None
 
     def work(self, context: bpy.types.Context) -> None:
         splat = current_splat(context)
@@ -129,12 +125,11 @@ def _fifth_of(splat: bpy.types.Object) -> float:
     return max(0.2 * float((high - low).max()) * splat.matrix_world.median_scale, 1e-6)
 
 
-class GIMP3D_OT_use_selected(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_use_selected(Edits, bpy.types.Operator):
     """Make the selected meshes boxes of the region; what counts is the box round each"""
 
     bl_idname = "gimp3d.use_selected"
     bl_label = "Use Selected as Boxes"
-    bl_options = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
         rois = context.scene.gimp3d.rois
@@ -146,12 +141,11 @@ class GIMP3D_OT_use_selected(ReportsErrors, bpy.types.Operator):
             rois.add().object = obj
 
 
-class GIMP3D_OT_forget_roi(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_forget_roi(Edits, bpy.types.Operator):
     """Take this box out of the region; the object stays"""
 
     bl_idname = "gimp3d.forget_roi"
     bl_label = "Forget Box"
-    bl_options = {"REGISTER", "UNDO"}
 
     index: IntProperty(name="Index", min=0)
 
@@ -159,23 +153,21 @@ class GIMP3D_OT_forget_roi(ReportsErrors, bpy.types.Operator):
         context.scene.gimp3d.rois.remove(self.index)
 
 
-class GIMP3D_OT_clear_rois(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_clear_rois(Edits, bpy.types.Operator):
     """Forget the boxes (the objects stay); the active cube is the region then"""
 
     bl_idname = "gimp3d.clear_rois"
     bl_label = "Clear Boxes"
-    bl_options = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
         context.scene.gimp3d.rois.clear()
 
 
-class GIMP3D_OT_enlarge_roi(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_enlarge_roi(Edits, bpy.types.Operator):
     """Enlarge the box to hold what it cut off of the object, as the last preview or removal found it"""
 
     bl_idname = "gimp3d.enlarge_roi"
     bl_label = "Enlarge Box"
-    bl_options = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
         settings, splat, cubes = context.scene.gimp3d, current_splat(context), current_boxes(context)
@@ -201,12 +193,3 @@ def proposed(context: bpy.types.Context) -> tuple[int, Box | None]:
         return int(found.get("gaussians", 0)), Box.make(**found["box"]) if found.get("box") else None
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, BadInput):
         return 0, None
-
-
-CLASSES = (
-    GIMP3D_OT_add_roi,
-    GIMP3D_OT_use_selected,
-    GIMP3D_OT_forget_roi,
-    GIMP3D_OT_clear_rois,
-    GIMP3D_OT_enlarge_roi,
-)

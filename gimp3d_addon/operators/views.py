@@ -17,7 +17,8 @@ from gimp3d.io.cameras import read_cameras
 from gimp3d.orbit import measured_up, orbit_cameras
 
 from .. import backdrops, bridge, charts, splats, trust
-from .base import ReportsErrors, current_boxes, current_splat, link
+from ..chosen import current_boxes, current_splat
+from .base import BOX, SPLAT, Edits, Need, link
 
 COLLECTION = "3D-GIMP views"
 DISPLAY_SHARE = 0.1  # of the cameras' spread: their frames are drawn so large that they do not hide the scene
@@ -45,12 +46,12 @@ def add_cameras(
         context.scene.camera = collection.objects[0]
 
 
-class GIMP3D_OT_import_cameras(ReportsErrors, bpy.types.Operator, ImportHelper):
+class GIMP3D_OT_import_cameras(Edits, bpy.types.Operator, ImportHelper):
     """Import the cameras of the photos (transforms.json, cameras.json or a COLMAP model) in the splat's frame"""
 
     bl_idname = "gimp3d.import_cameras"
     bl_label = "Import Cameras"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (SPLAT,)  # cameras are placed in its frame
 
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
     images: StringProperty(name="Photos", subtype="DIR_PATH", description="Folder of the photos, if not beside")
@@ -67,11 +68,6 @@ class GIMP3D_OT_import_cameras(ReportsErrors, bpy.types.Operator, ImportHelper):
         name="Photos as Backgrounds", default=True, description="Show each photo behind its camera's view"
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Step 1: import the splat scene first, as cameras are placed in its frame")
-        return current_splat(context) is not None
-
     def work(self, context: bpy.types.Context) -> None:
         path = Path(bpy.path.abspath(self.filepath))
         if path.suffix in (".bin", ".txt"):
@@ -85,12 +81,12 @@ class GIMP3D_OT_import_cameras(ReportsErrors, bpy.types.Operator, ImportHelper):
         self.report({"INFO"}, f"{len(cameras)} cameras")
 
 
-class GIMP3D_OT_add_views(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_add_views(Edits, bpy.types.Operator):
     """Make cameras round the region, for a scene that has none; the splats alone are enough"""
 
     bl_idname = "gimp3d.add_views"
     bl_label = "Add Orbit Views"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (SPLAT, BOX)
 
     count: IntProperty(name="Views", default=24, min=1, max=300, description="Cameras on three rings round the box")
     width: IntProperty(name="Width", default=960, min=16, max=8192, description="Of each view's picture, pixels")
@@ -106,14 +102,6 @@ class GIMP3D_OT_add_views(ReportsErrors, bpy.types.Operator):
         description="What the rings of cameras stand round",
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if current_splat(context) is None:
-            cls.poll_message_set("Step 1: import a splat scene")
-            return False
-        cls.poll_message_set("Step 2: put a box round the object; the views look at it")
-        return bool(current_boxes(context))
-
     def work(self, context: bpy.types.Context) -> None:
         splat = current_splat(context)
         context.view_layer.update()
@@ -126,20 +114,15 @@ class GIMP3D_OT_add_views(ReportsErrors, bpy.types.Operator):
         add_cameras(context, cameras, splat)
 
 
-class GIMP3D_OT_look_through(ReportsErrors, bpy.types.Operator):
+class GIMP3D_OT_look_through(Edits, bpy.types.Operator):
     """Look through the next view; it becomes the active camera, and the render size becomes the view's own"""
 
     bl_idname = "gimp3d.look_through"
     bl_label = "Look Through View"
-    bl_options = {"REGISTER", "UNDO"}
+    needs = (Need("Step 3: add views first", lambda context: context.scene.gimp3d.views != "ANIMATED"),)
 
     step: IntProperty(name="Step", default=0, description="How many views on from the active camera; may be negative")
     camera: StringProperty(name="Camera", description="Name of a camera object; empty: by step")
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("Step 3: add views first")
-        return context.scene.gimp3d.views != "ANIMATED"
 
     def work(self, context: bpy.types.Context) -> None:
         scene = context.scene
@@ -159,6 +142,3 @@ class GIMP3D_OT_look_through(ReportsErrors, bpy.types.Operator):
         view = getattr(context, "region_data", None)
         if view is not None:
             view.view_perspective = "CAMERA"
-
-
-CLASSES = (GIMP3D_OT_import_cameras, GIMP3D_OT_add_views, GIMP3D_OT_look_through)

@@ -21,7 +21,7 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.images import write_png
 from gimp3d_addon import bridge, command, jobs
-from gimp3d_addon.operators.base import current_boxes, current_splat
+from gimp3d_addon.chosen import current_boxes, current_splat
 from gimp3d_addon.operators.remove import SOURCE
 from gimp3d_addon.worker import Worker
 

@@ -11,7 +11,7 @@ from scenes import cameras, scene
 
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
-from gimp3d_addon.operators.base import current_splat
+from gimp3d_addon.chosen import current_splat
 from gimp3d_addon.operators.remove import SOURCE
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

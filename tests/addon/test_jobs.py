@@ -19,7 +19,8 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
 from gimp3d_addon import jobs, lock, splats
-from gimp3d_addon.operators.base import RunsChild, current_splat
+from gimp3d_addon.chosen import current_splat
+from gimp3d_addon.operators.base import RunsChild
 from gimp3d_addon.worker import Worker
 
 

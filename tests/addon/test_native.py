@@ -16,7 +16,7 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import read_ply
 from gimp3d_addon import native, splats
-from gimp3d_addon.operators.base import current_splat
+from gimp3d_addon.chosen import current_splat
 
 
 def native_object(gaussians: Gaussians, as_points: bool, first_sh: int = 1) -> bpy.types.Object:

@@ -20,7 +20,7 @@ from gimp3d.forecast import Clock, forecast_removal
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
-from gimp3d_addon import bridge, jobs, panels, steps
+from gimp3d_addon import bridge, classes_of, jobs, panels, steps
 from gimp3d_addon.operators.base import RunsChild
 from gimp3d_addon.worker import Worker, duration
 
@@ -70,8 +70,9 @@ class Options:
 def drawn() -> list[str]:
     """Every text, property and operator of the tab."""
     log: list[str] = []
-    for cls in panels.CLASSES[1:]:  # the presets' menu is Blender's own
-        Drawable(cls, log).draw()
+    for cls in classes_of(panels):
+        if issubclass(cls, bpy.types.Panel) and cls is not panels.GIMP3D_PT_presets:  # that menu is Blender's own
+            Drawable(cls, log).draw()
     return log
 
 

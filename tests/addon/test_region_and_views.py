@@ -17,7 +17,8 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import write_png
 from gimp3d_addon import bridge, steps
-from gimp3d_addon.operators.base import current_boxes, select_only
+from gimp3d_addon.chosen import current_boxes
+from gimp3d_addon.operators.base import select_only
 
 FRAME = Matrix.LocRotScale(Vector((3, -2, 1)), Euler((0.7, -0.4, 1.9)), Vector((1.7, 1.7, 1.7)))
 

@@ -16,7 +16,8 @@ import pytest
 
 from gimp3d.io.ply import read_ply
 from gimp3d_addon import jobs, splats
-from gimp3d_addon.operators.base import RunsChild, current_splat
+from gimp3d_addon.chosen import current_splat
+from gimp3d_addon.operators.base import RunsChild
 from gimp3d_addon.operators.reference import GIMP3D_OT_export_reference, RunsReference
 from gimp3d_addon.operators.remove import SOURCE, GIMP3D_OT_remove_object, RunsRemoval
 from gimp3d_addon.worker import GIVE_WAY, Worker

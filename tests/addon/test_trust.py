@@ -18,10 +18,10 @@ from gimp3d.io.cameras import read_cameras
 from gimp3d.io.images import write_png
 from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d_addon import bridge, jobs, steps, trust
+from gimp3d_addon.installation import user_folder
 from gimp3d_addon.operators import base
 from gimp3d_addon.operators.base import AsksFirst, RunsChild
 from gimp3d_addon.operators.remove import RunsRemoval
-from gimp3d_addon.properties import user_folder
 
 SIZE = (120, 90)
 

@@ -23,7 +23,14 @@ def psnr(
     truth: np.ndarray,  # [H, W, 3] uint8
     mask: np.ndarray,  # [H, W] bool, not empty
 ) -> float:
-    """Peak signal-to-noise ratio in dB over the mask's pixels and channels."""
+    """Peak signal-to-noise ratio in dB over the mask's pixels and channels.
+
+    Examples
+    --------
+    >>> truth, mask = np.zeros((4, 4, 3), np.uint8), np.ones((4, 4), bool)
+    >>> round(psnr(truth + np.uint8(16), truth, mask), 2)
+    24.05
+    """
     error = ((pred[mask].astype(np.float64) - truth[mask]) ** 2).mean()
     return PSNR_OF_EQUAL if error == 0 else min(PSNR_OF_EQUAL, 10 * float(np.log10(255.0**2 / error)))
 

@@ -55,12 +55,23 @@ def read_cameras(
     path: Path | str,
     images: Path | None = None,  # folder of the photos; default: beside the camera file
 ) -> tuple[Camera, ...]:
-    """Read cameras of any known kind, told apart by content.
+    """Read a nerfstudio transforms.json, an Inria cameras.json or a COLMAP folder, told apart by content.
+
+    Returns
+    -------
+    tuple of Camera
+        In the file's order: OpenCV axes, world→camera, pixel centres at integer + ½, focal lengths in pixels.
 
     Raises
     ------
     BadInput
         If the file is missing, of another kind, empty, or a camera is of a kind that cannot be used.
+
+    Examples
+    --------
+    >>> camera = read_cameras("transforms.json")[0]
+    >>> camera.width, camera.height, camera.viewmat.shape
+    (60, 45, (4, 4))
     """
     path = Path(path)
     if path.is_dir():

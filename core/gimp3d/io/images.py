@@ -79,12 +79,24 @@ def undistorted(camera: Camera) -> Camera:
 
 
 def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
-    """A camera's photo [H, W, 3] uint8, resampled to the camera's size and undistorted, and its pinhole camera.
+    """A camera's photo, resampled to the camera's size and undistorted, and its pinhole camera.
+
+    Returns
+    -------
+    photo : ndarray, [H, W, 3] uint8
+    camera : Camera
+        Without distortion, of the same size.
 
     Raises
     ------
     BadInput
         If the photo is missing, unreadable or of another aspect ratio than the camera.
+
+    Examples
+    --------
+    >>> photo, pinhole = load_view(read_cameras("transforms.json")[0])
+    >>> photo.shape, pinhole.distortion
+    ((45, 60, 3), None)
     """
     if camera.image is None:
         raise BadInput(f"camera {camera.id} has no photo")

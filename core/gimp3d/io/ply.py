@@ -72,12 +72,24 @@ class SplatFile:
 
 
 def read_ply(path: Path | str) -> SplatFile:
-    """Read a Gaussian PLY.
+    """Read a Gaussian PLY (3DGS or 2DGS), by the names of its properties.
+
+    Returns
+    -------
+    SplatFile
+        `gaussians`: means [N, 3] and log_scales [N, 3 or 2] in scene units, quats [N, 4] as wxyz, opacity_logits [N],
+        sh [N, K, 3]; `table`: the file's rows as they are, for `write_ply`.
 
     Raises
     ------
     BadInput
         If the file is missing, damaged, or not a Gaussian scene, saying which.
+
+    Examples
+    --------
+    >>> file = read_ply("scene.ply")
+    >>> file.gaussians.means.dtype, file.gaussians.sh.shape[1:]
+    (dtype('float32'), (1, 3))
     """
     path = Path(path)
     table = read_table(path)
@@ -100,6 +112,13 @@ def write_ply(
         If the file cannot be written.
     ValueError
         If a new Gaussian is not finite, or `keep` is not a bool for each row.
+
+    Examples
+    --------
+    >>> file = read_ply("scene.ply")
+    >>> write_ply("upper.ply", file, keep=file.gaussians.means[:, 2] > 0.1)
+    >>> len(read_ply("upper.ply").gaussians) < len(file.gaussians)
+    True
     """
     if keep.shape != (len(file.table.rows),) or keep.dtype != bool:
         raise ValueError(f"keep: {len(file.table.rows)} bools expected, got {keep.dtype} {keep.shape}")

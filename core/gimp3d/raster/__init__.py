@@ -59,17 +59,29 @@ def render(
     passes: frozenset[str] = ALL_PASSES,
     pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> Rendering:
-    """Draw a scene (paper eq. 1 and 2).
+    """Draw a scene (paper, equations 1 and 2).
 
     Parameters
     ----------
     passes
         Any of rgb, alpha, depth (both depths), expected_depth, normal and distortion; only these are computed.
 
+    Returns
+    -------
+    Rendering
+        rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene units (0: nothing),
+        normals [H, W, 3] in the camera's frame; all float32, None where not asked for.
+
     Raises
     ------
     ValueError
         If a pass is unknown, or the mask has not the picture's shape.
+
+    Examples
+    --------
+    >>> picture = render(read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0])
+    >>> picture.rgb.shape, float(picture.alpha.max()) > 0.9
+    ((45, 60, 3), True)
     """
     return current_backend().render(gaussians, camera, settings, passes, pixels)
 
@@ -91,17 +103,43 @@ def trace(
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
 ) -> tuple[Rendering, Trace]:
-    """As `render`, and what `backward` needs. The Gaussians' arrays must not change until then."""
+    """As `render`, and what `backward` needs. The Gaussians' arrays must not change until then.
+
+    Raises
+    ------
+    ValueError
+        If a pass is unknown.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> picture, traced = trace(scene, camera, passes=frozenset({"rgb"}))
+    >>> bool((picture.rgb == render(scene, camera).rgb).all())
+    True
+    """
     return current_backend().trace(gaussians, camera, settings, passes)
 
 
 def backward(traced: Trace, gradients: PictureGradients) -> Gradients:
     """The gradient of a loss with respect to the traced Gaussians, given that with respect to their pictures.
 
+    Returns
+    -------
+    Gradients
+        Of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32.
+
     Raises
     ------
     ValueError
         If a gradient has not its picture's shape, or the picture was not rendered.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> picture, traced = trace(scene, camera, passes=frozenset({"rgb"}))
+    >>> gradients = backward(traced, PictureGradients(rgb=np.ones_like(picture.rgb)))  # of the sum of all colours
+    >>> gradients.sh.shape == scene.sh.shape
+    True
     """
     return traced.backward(gradients)
 
@@ -123,6 +161,15 @@ def pixel_region(
     ------
     ValueError
         If the mask has not the picture's shape, or a pass is unknown.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> moving = np.arange(len(scene)) >= len(scene) - 10
+    >>> region = pixel_region(scene.take(~moving), camera, np.ones((45, 60), bool))
+    >>> picture, traced = region.trace(scene.take(moving))
+    >>> bool(np.allclose(picture.rgb, render(scene, camera).rgb, atol=1e-3))
+    True
     """
     return current_backend().pixel_region(frozen, camera, pixels, settings, passes)
 
@@ -138,6 +185,19 @@ def drawing(
 
     Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
     while a drawing is in use, and it is not for two threads at once.
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> view = drawing(scene, camera)
+    >>> rgb, (depth, alpha) = view.render(frozenset({"rgb"})).rgb, view.surface_depth()
+    >>> rgb.shape, depth.shape
+    ((45, 60, 3), (45, 60))
     """
     return current_backend().drawing(gaussians, camera, settings, with_colour, pixels)
 
@@ -149,7 +209,20 @@ def footprint(
     settings: RasterSettings = RasterSettings(),
     pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> np.ndarray:
-    """Accumulated blend weight of the chosen Gaussians, [H, W] float32; others may hide them."""
+    """Accumulated blend weight of the chosen Gaussians, [H, W] float32 in 0 … 1; others may hide them.
+
+    Raises
+    ------
+    ValueError
+        If `chosen` or the mask has the wrong shape.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> shown = footprint(scene, camera, chosen=scene.means[:, 2] > 0.1)
+    >>> shown.shape, 0 < (shown > 0.5).mean() < 1
+    ((45, 60), True)
+    """
     return drawing(gaussians, camera, settings, False, pixels).footprint(chosen)
 
 
@@ -159,10 +232,27 @@ def surface_depth(
     settings: RasterSettings = RasterSettings(),
     pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha; both [H, W] float32.
+    """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
-    splats (Yu 2024; Zhang 2024). 0 where alpha < 0.5.
+    splats (Yu 2024; Zhang 2024).
+
+    Returns
+    -------
+    depth : ndarray, [H, W] float32
+        Scene units; 0 where alpha < 0.5.
+    alpha : ndarray, [H, W] float32
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
+
+    Examples
+    --------
+    >>> depth, alpha = surface_depth(read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0])
+    >>> bool((depth[alpha < 0.5] == 0).all())
+    True
     """
     return drawing(gaussians, camera, settings, False, pixels).surface_depth()
 
@@ -173,7 +263,25 @@ def contributions(
     settings: RasterSettings = RasterSettings(),
     pixels: np.ndarray | None = None,  # [H, W] bool: only these count
 ) -> Contributions:
-    """Sum and maximum of every Gaussian's blend weights over the pixels of a view."""
+    """Sum and maximum of every Gaussian's blend weights over the pixels of a view.
+
+    Returns
+    -------
+    Contributions
+        total [N] float32, the sum, and peak [N] float32, the maximum.
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
+
+    Examples
+    --------
+    >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
+    >>> weights = contributions(scene, camera)
+    >>> bool((weights.peak <= weights.total + 1e-6).all())
+    True
+    """
     return current_backend().contributions(gaussians, camera, settings, pixels)
 
 
