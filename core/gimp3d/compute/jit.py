@@ -81,4 +81,4 @@ def announce_compilation(say: Callable[[str], object] = logging.getLogger("gimp3
     global _to_announce
     if _to_announce:
         _to_announce = False
-        say("first run on this machine: compiling kernels, up to 15 seconds")
+        say("first run on this machine: compiling kernels, about a minute")

@@ -33,7 +33,7 @@ def painter(command: str, call: Call) -> Painter:
     words = split(command, call.option, ("{image}", "{mask}", "{out}"), ("{out}",))
 
     def paint(image: np.ndarray, mask: np.ndarray, seed: int, call: Call) -> np.ndarray:
-        return asked(words, {"image": image, "mask": mask}, ("out.png",), call, read_image)
+        return asked(words, {"image": image, "mask": mask}, ("out.png",), "wrote no {out} picture", call, read_image)
 
     return Painter(words[0], paint, f"the picture that {words[0]} wrote", whole=True)
 
@@ -42,6 +42,7 @@ def asked(
     words: Sequence[str],
     given: Mapping[str, np.ndarray],  # the picture that {name} stands for
     answers: Sequence[str],  # names of the files that it may write, each {name} without the ending; the first counts
+    missing: str,  # what it did wrong if it wrote none of them
     call: Call,
     read: Callable[[Path], np.ndarray],
 ) -> np.ndarray:
@@ -54,8 +55,7 @@ def asked(
         for name in answers:
             if (Path(folder) / name).exists():
                 return read(Path(folder) / name)
-    wanted = " nor ".join(f"{{{Path(name).stem}}}" for name in reversed(answers))
-    raise BadInput(f"{call.option} command: {words[0]} wrote {'no' if len(answers) == 1 else 'neither'} {wanted}")
+    raise BadInput(f"{call.option} command: {words[0]} {missing}")
 
 
 def split(command: str, option: str, names: Sequence[str], needed: Sequence[str]) -> list[str]:

@@ -171,8 +171,10 @@ def _by_command(text: str, call: Call) -> Look:
 
     def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
         assert image is not None
-        found = ("npy.npy", "out.png")
-        return command.asked(words, {"image": image}, found, call, lambda path: _from_file(path, height, width))
+        found, missing = ("npy.npy", "out.png"), "wrote neither {out} nor {npy}"
+        return command.asked(
+            words, {"image": image}, found, missing, call, lambda path: _from_file(path, height, width)
+        )
 
     return look
 
