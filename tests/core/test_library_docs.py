@@ -111,7 +111,6 @@ def places() -> list[tuple[str, str]]:
     return found
 
 
-@pytest.mark.xfail(strict=False, reason="the page names files as they lie after the merge; remove then")
 def test_what_the_architecture_page_names_is_there() -> None:
     assert len(places()) > 20
     missing = []

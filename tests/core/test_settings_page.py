@@ -20,7 +20,6 @@ def test_the_page_is_what_the_tool_writes() -> None:
     assert settings_page.PAGE.read_text(encoding="utf-8") == settings_page.page()
 
 
-@pytest.mark.xfail(strict=False, reason="fields that stay get their comments on other branches; remove after the merge")
 def test_every_setting_says_its_unit_and_what_it_trades() -> None:
     assert [e.key for e in ENTRIES if not e.trades] == []
     numbers = [e for e in ENTRIES if isinstance(e.default, int | float) and not isinstance(e.default, bool)]

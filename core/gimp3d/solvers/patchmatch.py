@@ -45,7 +45,7 @@ class PatchMatchSettings:
     patch: AtLeastOne = 5  # px, side, odd (paper 4.1); larger ones tell more apart and reach less close to the hole
     coherence: float = 0.001  # λ_s (paper 4.1); higher copies larger pieces that fit less
     sweeps: int = 4  # number; more come nearer to the best sources and take as much longer
-    seed: Seed = 0  # of the random search
+    seed: Seed = 0  # number; added to the removal's: another one gives another field
 
 
 @dataclass(frozen=True)
