@@ -26,7 +26,7 @@ from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .job import RemovalJob
-from .memory import GAUSSIAN, VIEW_PIXEL, peak_memory_mb, require_memory
+from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
 from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
@@ -36,11 +36,12 @@ from .report import draw, write_charts, write_removal_report
 from .run import Run
 from .settings import job_settings, shadow_of
 from .stages.charts import Chart, chart_number
-from .stages.completion import charts_to_paint
-from .stages.light import NOT_LIT
 from .stages.masks import MaskSettings, find_masks
+from .steps.completion import charts_to_paint
+from .steps.light import NOT_LIT
 from .store import StageStore
 from .stored import STORED
+from .summary import summary_of
 from .view_state import ViewState
 
 PASSES = ("rgb", "alpha", "depth", "normal")
@@ -331,7 +332,7 @@ def run_removal(
         allow_network,
     )
     result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
-    summary = _summary(job, settings, file, result, warnings, time.perf_counter() - start)
+    summary = summary_of(job, settings, file, result, warnings, time.perf_counter() - start)
     _write_beside(job, folder, scene, views, result, summary)
     write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
     return summary
@@ -431,66 +432,6 @@ def _scene_warnings(file: SplatFile) -> list[str]:
     if not unusable:
         return []
     return [f"{unusable} Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"]
-
-
-def _summary(
-    job: RemovalJob,
-    settings: RemovalSettings,
-    file: SplatFile,
-    result: RemovalResult,
-    warnings: Sequence[str],
-    seconds: float,
-) -> dict[str, Any]:
-    removed, added = int((~result.keep).sum()), len(result.added) if result.added else 0
-    return {
-        "version": __version__,
-        "command": "remove",
-        "seconds_total": round(seconds, 3),
-        "stages": [asdict(s) for s in result.stages],
-        "counts": {
-            "gaussians_in": len(file.gaussians),
-            "removed": removed,
-            "added": added,
-            "gaussians_out": len(file.gaussians) - removed + added,
-            "lifted": result.lifted,
-            **_cost(file, result.added),
-            "views": result.views,
-            "hole_pixels": result.hole_pixels,
-            "open_pixels": result.open_pixels,
-        },
-        "verdict": asdict(result.verdict) if result.verdict else None,
-        "selection": result.selection,
-        "proposed": result.proposed,
-        "shadow": result.shadow,
-        "reflection": result.reflection,
-        "charts": [
-            {
-                "kind": chart.kind,
-                "texels": int(chart.there.sum()),
-                "hole_texels": int(chart.hole.sum()),
-                "photos_median": float(np.median(chart.photos[chart.known])) if chart.known.any() else 0.0,
-            }
-            for chart in result.charts
-        ],
-        "refined_views": result.refined_views,
-        "references": [asdict(choice) for choice in result.references],
-        "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
-        "warnings": [*warnings, *result.warnings],
-        "peak_memory_mb": round(peak_memory_mb(), 1),
-    }
-
-
-def _cost(file: SplatFile, added: Gaussians | None) -> dict[str, int]:
-    """What the new Gaussians need: bytes in the file (binary ones), and how many use which SH degree."""
-    if added is None or not len(added):
-        return {}
-    used = (added.sh != 0).any(2)
-    highest = np.ceil(np.sqrt(used.shape[1] - used[:, ::-1].argmax(1))).astype(int) - 1
-    degrees = np.where(used.any(1), highest, 0)
-    cost = {f"added_of_degree_{d}": int((degrees == d).sum()) for d in range(added.sh_degree + 1)}
-    if file.table.format == "ascii":
-        return cost
-    return {"added_bytes": len(added) * file.table.rows.dtype.itemsize, **cost}
 
 
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:

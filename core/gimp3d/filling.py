@@ -13,7 +13,12 @@ from .errors import IllPosed
 from .gaussians import Gaussians
 from .geometry import SAME_DEPTH, SOLID
 from .run import Run, counted
-from .stages.carrying import (
+from .stages.charts import Chart
+from .stages.propagate import Reference
+from .stages.reference import choose_reference
+from .stages.refine import observed, refine_gaussians
+from .steps.asking import ask_to_refine, with_answers
+from .steps.carrying import (
     as_reference,
     map_reference,
     paint_views,
@@ -22,8 +27,7 @@ from .stages.carrying import (
     snapped,
     with_own_picture,
 )
-from .stages.charts import Chart
-from .stages.completion import (
+from .steps.completion import (
     Completed,
     Turn,
     carried_over,
@@ -32,11 +36,7 @@ from .stages.completion import (
     paint_view,
     texels_to_fill,
 )
-from .stages.coverage import after_reference, emptied
-from .stages.propagate import Reference
-from .stages.reference import choose_reference
-from .stages.refine import observed, refine_gaussians
-from .stages.view_refinement import ask_to_refine, with_answers
+from .steps.coverage import after_reference, emptied
 from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open

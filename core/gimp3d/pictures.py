@@ -13,13 +13,13 @@ from .geometry import window_mask
 from .raster import footprint, touched_window
 from .result import Picture
 from .stages.charts import Chart
-from .stages.completion import Completed
 from .stages.depth import DepthCompletion
-from .stages.light import Relit
 from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation
 from .stages.view_refinement import ViewRefinement
+from .steps.completion import Completed
+from .steps.light import Relit
 from .view_state import ViewState
 
 T = TypeVar("T")

@@ -21,12 +21,12 @@ from .raster import render_bytes
 from .result import Picture, RemovalResult, StageReport, View
 from .run import Observer, Run, Store, unobserved
 from .stages.charts import Chart
-from .stages.completion import charts_to_paint, complete_view_depth, turns_of
 from .stages.exposure import exposures_of
-from .stages.light import NOT_LIT, Relit, find_light, undo_light
 from .stages.masks import Masks, find_masks
-from .stages.surfaces import chart_surfaces, find_surfaces
 from .stages.verdict import judge
+from .steps.completion import charts_to_paint, complete_view_depth, turns_of
+from .steps.light import NOT_LIT, Relit, find_light, undo_light
+from .steps.surfaces import chart_surfaces, find_surfaces
 from .view_state import ViewState, open_pixels
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import Any
 
 from .errors import BadInput
 from .job import SHADOWS, RemovalJob
-from .pipeline import PRESETS, RemovalSettings
+from .presets import PRESETS, RemovalSettings
 from .schema import within
 
 

@@ -11,7 +11,6 @@ from .stages.exposure import Exposure, Exposures
 from .stages.ground import Ground
 from .stages.growth import Growth
 from .stages.lifting import Lifted
-from .stages.light import Found
 from .stages.light_search import Light
 from .stages.mapping import MappingField
 from .stages.masks import Masks, ViewMasks
@@ -22,9 +21,10 @@ from .stages.refine import Refinement
 from .stages.reflection import Reflection
 from .stages.selection import Selection
 from .stages.shadow import Shadow
-from .stages.surfaces import Charted, Surfaces
 from .stages.verdict import Verdict
 from .stages.view_refinement import RefinedView, ViewRefinement
+from .steps.light import Found
+from .steps.surfaces import Charted, Surfaces
 
 STORED = (
     Appearance, Box, Camera, Chart, Charted, DepthCompletion, Exposure, Exposures, Found, Gaussians, Ground, Growth,

@@ -15,14 +15,10 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
-from ..presets import RemovalSettings
 from ..priors.appearance import Painter, surroundings
 from ..priors.calls import Call
-from ..priors.inpaint import painter
 from ..priors.pasting import paste_picture, resized, scaled
-from ..view_state import ViewState
 from .propagate import Rule
-from .refine import looked_at
 
 KEPT = (Rule.UNTOUCHED, Rule.UNREACHED, Rule.EVIDENCE)  # pixels that nobody is asked about: known, or without a colour
 LEAST = 64  # pixels of a view that somebody is asked about
@@ -74,31 +70,6 @@ class ViewRefinement:
             "accepted": sum(v.image is not None for v in self.views),
             "views": {v.camera_id: {"accepted": v.image is not None, "reason": v.reason} for v in self.views},
         }
-
-
-def ask_to_refine(views: Sequence[ViewState], settings: RemovalSettings, call: Call) -> ViewRefinement:
-    """Ask the painter that the settings name about as many painted views as refinement looks at."""
-    asked = [
-        ViewToRefine(v.id, v.painted, v.rules, v.best[1].image, v.best[1].target)
-        for v in views
-        if v.rules is not None and v.best is not None
-    ]
-    who = painter(settings.refine_views, call)
-    return refine_views(who, looked_at(asked, settings.refine), settings.random_seed, call)
-
-
-def with_answers(views: Sequence[ViewState], asked: ViewRefinement) -> tuple[ViewState, ...]:
-    """The views with the answers that were accepted."""
-    answers = {a.camera_id: a.image for a in asked.views if a.image is not None}
-
-    def answered(view: ViewState) -> ViewState:
-        image = answers.get(view.id)
-        if image is None or view.rules is None:
-            return view
-        rules = np.where((image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
-        return replace(view, painted=image, rules=rules)
-
-    return tuple(map(answered, views))
 
 
 def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: Call) -> ViewRefinement:

@@ -19,12 +19,12 @@ from ..priors.calls import Call
 from ..priors.inpaint import inpaint_reference
 from ..priors.monodepth import depth_prior, looks
 from ..priors.pasting import paste_picture
+from ..stages.charts import CHART, Chart, chart_number
+from ..stages.depth import DepthCompletion, complete_depth
+from ..stages.evidence import gather_evidence
+from ..stages.propagate import Reference
+from ..stages.reference import rim
 from ..view_state import ViewState
-from .charts import CHART, Chart, chart_number
-from .depth import DepthCompletion, complete_depth
-from .evidence import gather_evidence
-from .propagate import Reference
-from .reference import rim
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z

@@ -13,9 +13,9 @@ from scenes import discs as discs_on
 from gimp3d.gaussians import Gaussians
 from gimp3d.geometry import window_mask
 from gimp3d.raster import footprint, render_bytes, surface_depth, touched_window
-from gimp3d.stages.coverage import redrawn, still_open
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
 from gimp3d.stages.propagate import Rule
+from gimp3d.steps.coverage import redrawn, still_open
 
 SETTINGS = MaskSettings()
 

@@ -10,12 +10,12 @@ import numpy as np
 from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
+from ..stages.charts import Chart, Plane, draw_charts, find_planes
+from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels
+from ..stages.masks import Masks
+from ..stages.selection import Selection
+from ..stages.witness import Witness
 from ..view_state import ViewState
-from .charts import Chart, Plane, draw_charts, find_planes
-from .clearing import Targets, chart_targets, clear_air, object_pixels
-from .masks import Masks
-from .selection import Selection
-from .witness import Witness
 
 
 @dataclass(frozen=True)

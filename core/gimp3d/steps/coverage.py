@@ -12,10 +12,10 @@ from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SOLID, dilated, window_mask
 from ..raster import Window, drawing, render_bytes, touched_window
+from ..stages.masks import MaskSettings, ViewMasks
+from ..stages.propagate import PaintedView, Reference, Rule
+from ..stages.targets import LAYER_STEP
 from ..view_state import ViewState
-from .masks import MaskSettings, ViewMasks
-from .propagate import PaintedView, Reference, Rule
-from .targets import LAYER_STEP
 
 OPAQUE = 0.99  # alpha of the emptied scene below which a gap shows through
 DRAWN = 0.5  # blend weight of new Gaussians from which they cover a pixel

@@ -24,7 +24,7 @@ from gimp3d.pipeline import (
     remove_object,
     render_bytes,
 )
-from gimp3d.stages.completion import Turn, turns_of
+from gimp3d.steps.completion import Turn, turns_of
 
 WALL = BLOCK / 2 + 0.02  # y of a wall right behind the block
 CORNER = (Box.make([0, 0, 0.26], [0.52, 0.52, 0.56]),)

@@ -12,14 +12,14 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..result import RemovalResult
+from ..stages.ground import look_at
+from ..stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
+from ..stages.masks import Masks
+from ..stages.reflection import Reflection, find_reflection
+from ..stages.shadow import Shadow, find_shadow, marked_shadow
+from ..stages.witness import Witness
 from ..view_state import ViewState
-from .ground import look_at
-from .lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
-from .masks import Masks
-from .reflection import Reflection, find_reflection
-from .shadow import Shadow, find_shadow, marked_shadow
 from .surfaces import Surfaces
-from .witness import Witness
 
 NOT_LOOKED_FOR = "not looked for"
 NO_SHADOW = {"found": False, "lights": [], "explained": 0.0}

@@ -13,12 +13,12 @@ from ..geometry import window_mask
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import surface_depth
+from ..stages.charts import CHART, Chart
+from ..stages.mapping import MappingField, mapping_field, source_visibility
+from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
+from ..stages.seed import colour_gaussians, seed_gaussians, settle_gaussians
 from ..view_state import ViewState
-from .charts import CHART, Chart
 from .completion import Completed
-from .mapping import MappingField, mapping_field, source_visibility
-from .propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
-from .seed import colour_gaussians, seed_gaussians, settle_gaussians
 
 
 def seed_surface(completed: Completed, surfels: bool, settings: RemovalSettings) -> Gaussians:
