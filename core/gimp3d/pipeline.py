@@ -23,7 +23,8 @@ from .run import Observer, Run, Store, unobserved
 from .stages.charts import Chart
 from .stages.exposure import exposures_of
 from .stages.masks import Masks, find_masks
-from .stages.verdict import judge
+from .stages.propagate import Reference
+from .stages.verdict import Verdict, judge
 from .steps.completion import charts_to_paint, complete_view_depth, turns_of
 from .steps.light import NOT_LIT, Relit, find_light, undo_light
 from .steps.surfaces import chart_surfaces, find_surfaces
@@ -84,20 +85,11 @@ def remove_object(
     run = Run(settings, progress, store, allow_network, observer)
     for notice in provider_notices(settings, allow_network):
         progress("read", 0, 1, notice)
-    for camera in (v.camera for v in views):
-        if camera.width < 1 or camera.height < 1:
-            raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
-    photos = {v.camera.id: v.image for v in views}
-    cameras = [v.camera for v in views]
-    masks = run("masks", find_masks, scene, region, cameras, settings.masks, progress, photos, extra_masks)
-    run.warnings += masks.warnings
+    masks = _find_object(run, scene, views, region, extra_masks)
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
         return NOT_LIT.with_changes(_result(run, masks, {}), scene)
-    if masks.left_out:
-        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
-
-    behind = look_behind(run, scene, region, masks, photos, shadow_masks or {})
+    behind = look_behind(run, scene, region, masks, {v.camera.id: v.image for v in views}, shadow_masks or {})
     masks, to_paint = behind.masks, charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
     run.pictures += pictures.of_charts(to_paint)
@@ -114,24 +106,8 @@ def remove_object(
     if (left := open_pixels(filling.views)) > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
-
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
-    truth = filling.done[0] if filling.done and by_picture else None  # what the result is held against
-    verdict = run(
-        "verdict",
-        judge,
-        behind.scene,
-        ~masks.removed,
-        filling.added,
-        masks.views,
-        [v.left.target for v in filling.views],
-        {v.id: v.bare for v in filling.views},
-        {v.camera.id for v in views if v.is_photo},
-        behind.charts,
-        {v.id: v.hits for v in filling.views if v.hits is not None},
-        truth,
-        words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
-    )
+    verdict = _judge(run, views, behind, filling, filling.done[0] if filling.done and by_picture else None)
     completed = {r.camera.id: r.image for r in filling.done}
     result = replace(
         _result(run, masks, _painted(filling, behind.lit) if masks.hole_pixels else {}),
@@ -142,6 +118,46 @@ def remove_object(
         refined_views=filling.asked,
     )
     return behind.lit.with_changes(result, scene)
+
+
+def _find_object(
+    run: Run, scene: Gaussians, views: Sequence[View], region: Region, extra: Mapping[str, np.ndarray] | None
+) -> Masks:
+    """What goes, and what that leaves open in every view."""
+    cameras, photos = [v.camera for v in views], {v.camera.id: v.image for v in views}
+    for camera in cameras:
+        if camera.width < 1 or camera.height < 1:
+            raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
+    masks = run("masks", find_masks, scene, region, cameras, run.settings.masks, run.progress, photos, extra)
+    run.warnings += masks.warnings
+    if masks.removed.any() and masks.left_out:
+        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    return masks
+
+
+def _judge(
+    run: Run,
+    views: Sequence[View],
+    behind: Behind,
+    filling: Filling,
+    truth: Reference | None,  # a reference whose picture was given: what the result is held against
+) -> Verdict | None:
+    """How good the result probably is."""
+    return run(
+        "verdict",
+        judge,
+        behind.scene,
+        ~behind.masks.removed,
+        filling.added,
+        behind.masks.views,
+        [v.left.target for v in filling.views],
+        {v.id: v.bare for v in filling.views},
+        {v.camera.id for v in views if v.is_photo},
+        behind.charts,
+        {v.id: v.hits for v in filling.views if v.hits is not None},
+        truth,
+        words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
+    )
 
 
 def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
