@@ -14,6 +14,7 @@ os.environ["GIMP3D_STATE"] = tempfile.mkdtemp(prefix="gimp3d-state-")  # records
 
 sys.path.insert(0, str(Path(__file__).parent))  # tests/scenes.py
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks
+sys.path.append(str(Path(__file__).parents[1] / "tools"))
 
 from property_tests import register_profiles
 from scenes import REGION, cameras, scene

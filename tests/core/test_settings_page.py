@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
 import pytest
+import settings_page
 
 from gimp3d.commands import job_settings
 from gimp3d.job import RemovalJob
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-settings_page = importlib.import_module("settings_page")
 ENTRIES = tuple(settings_page.entries())
 
 

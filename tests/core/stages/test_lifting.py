@@ -7,21 +7,33 @@ from functools import cache
 
 import cv2
 import numpy as np
-from light_ablation import Prepared, found_in, made
 from lit_scenes import Lamp, make_scene
 
 from gimp3d.camera import Camera
+from gimp3d.presets import PRESETS
+from gimp3d.raster import render_bytes
+from gimp3d.stages.exposure import exposures_of
 from gimp3d.stages.lifting import Arriving, _lifted, light_in
+from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
+from gimp3d.steps.light import find_light
+from gimp3d.steps.surfaces import find_surfaces
+from gimp3d.view_state import ViewState
 
 
 @cache
-def prepared() -> tuple[Prepared, Shadow]:
-    scene = made(make_scene("waves", [Lamp(40, 110, 3)]))
-    found = found_in(scene)
-    assert isinstance(found, Shadow)
-    return scene, found
+def prepared() -> tuple[list[Witness], Shadow]:
+    """A made scene's views as evidence, and the shadow that is found in them."""
+    lit, settings = make_scene("waves", [Lamp(40, 110, 3)]), PRESETS["draft"]
+    photos = {c.id: render_bytes(lit.gaussians, c) for c in lit.cameras()}
+    masks = find_masks(lit.gaussians, lit.region, lit.cameras(), photos=photos)
+    exposures = exposures_of(lit.gaussians.take(~masks.removed), masks.views, photos)
+    views = [ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views)]
+    surfaces = find_surfaces(lit.gaussians, lit.region, masks, views, settings)
+    found = find_light(lit.gaussians, lit.region, masks, surfaces, views, {}, settings)
+    assert found.shadow is not None
+    return surfaces.witnesses(views), found.shadow
 
 
 def light(witness: Witness) -> np.ndarray:
@@ -35,7 +47,7 @@ def light(witness: Witness) -> np.ndarray:
 def test_what_is_drawn_below_the_ground_is_lifted_nowhere() -> None:
     """Nothing can be seen there: rough splats err, and light does not arrive below the object."""
     shaded = strange = 0
-    for witness in prepared()[0].witnesses[::3]:
+    for witness in prepared()[0][::3]:
         far = cv2.dilate((witness.hidden | witness.beside).astype(np.uint8), np.ones((9, 9), np.uint8)) == 0
         below = replace(witness, depth=np.float32(1.5) * witness.depth, photo=255 - witness.photo)
         shaded += int((light(witness) < 0.9)[far].sum())
