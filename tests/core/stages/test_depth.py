@@ -1,4 +1,4 @@
-"""Depth completion: scenes with a known answer, and every ill-posed case of METHOD section 8."""
+"""Depth completion: scenes with a known answer, and every ill-posed case of docs/method.md."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_the_papers_fixed_scale_is_used_as_set():
     assert relative_error(found, truth, blob()).max() < 1e-3
 
 
-# Priors that say nothing (METHOD section 8)
+# Priors that say nothing (docs/method.md, ill-posed cases)
 
 
 @pytest.mark.parametrize(
