@@ -10,6 +10,7 @@ import pytest
 from scenes import REGION, cameras, scene
 
 from gimp3d.errors import BadInput
+from gimp3d.forecast import forecast_removal
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 
@@ -31,6 +32,8 @@ def test_an_observer_sees_every_stage_in_order_with_what_it_takes_and_makes() ->
     result = remove_object(scene(), views(), REGION, PRESETS["draft"], observer=watch)
     assert list(seen)[: len(IN_ORDER)] == IN_ORDER and list(seen)[-1] == "verdict"
     assert list(seen) == [stage.name for stage in result.stages]
+    # or progress would stand still: a stage that the forecast does not know counts nothing
+    assert set(forecast_removal(1000, 5, 5 * 120 * 90, "draft").stages) - set(seen) == {"read", "lift"}
     assert seen["masks"][0] is not None and isinstance(seen["settle"][-1], Gaussians)
     assert result.verdict is seen["verdict"][-1]
     assert all(stage.seconds >= 0 and stage.reason for stage in result.stages)

@@ -52,7 +52,7 @@ class Painter:
     notice: str = ""  # what is sent where and what that costs, said before anything is done
 
 
-def surroundings(hole: np.ndarray) -> tuple[slice, slice]:
+def window_round_hole(hole: np.ndarray) -> tuple[slice, slice]:
     """The hole's bounding box, larger by its own size on every side."""
     spans = []
     for axis in (0, 1):

@@ -11,7 +11,7 @@ from ..errors import BadInput
 from ..solvers.exemplar import ExemplarSettings, complete_picture
 from ..solvers.patchmatch import nearest_allowed
 from ..solvers.surface import tangent_planes
-from .appearance import Appearance, Provider, Unfinished, surroundings
+from .appearance import Appearance, Provider, Unfinished, window_round_hole
 
 SPECK = 4  # px; smaller parts of a hole are interpolated
 CONFIDENCE_SCALE = 20.0  # grey levels of misfit at which the confidence has fallen to 1/e
@@ -33,7 +33,7 @@ def without_specks(provider: Provider, view: Unfinished) -> Appearance:
 
 def exemplar(view: Unfinished) -> Appearance:
     """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
-    near = surroundings(view.hole)
+    near = window_round_hole(view.hole)
     surface = None
     if view.disparity is not None and view.K is not None:
         corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import BadInput, IllPosed
 from ..io.images import read_image
 from . import command, gemini, onnx, servers, torchscript
-from .appearance import Appearance, Painter, Provider, Unfinished, surroundings
+from .appearance import Appearance, Painter, Provider, Unfinished, window_round_hole
 from .builtin import PROVIDERS, without_specks
 from .calls import Call
 from .pasting import paste_picture
@@ -99,7 +99,7 @@ def _provider(spec: str, call: Call) -> Provider:
 
 def _painted(who: Painter, view: Unfinished, call: Call) -> Appearance:
     """The hole's surroundings, or the whole view, as a painter shows them without the object."""
-    part = (slice(None), slice(None)) if who.whole else surroundings(view.hole)
+    part = (slice(None), slice(None)) if who.whole else window_round_hole(view.hole)
     image, hole = view.image[part], view.hole[part]
     unknown = np.zeros_like(hole) if view.unknown is None else view.unknown[part] & ~hole
     if who.notice:

@@ -36,7 +36,7 @@ NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
 
 
 @dataclass(frozen=True)
-class View:
+class Projected:
     """Gaussians projected into a camera."""
 
     features: np.ndarray  # [N, 16 or 32] float32
@@ -53,15 +53,15 @@ def project(
     camera: Camera,
     settings: RasterSettings,
     with_colour: bool,
-    out: View | None = None,
+    out: Projected | None = None,
     slots: np.ndarray | None = None,
-) -> View:
+) -> Projected:
     """Feature rows of the Gaussians that reach the picture, or what slots there are; into `out` where it is given."""
     announce_compilation()
     n = len(gaussians)
     if out is None:
         features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
-        out = View(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+        out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
     *geometry, sh = values_of(gaussians)
     run_ranges(
         project_range,
@@ -214,7 +214,7 @@ class Trace:
     """What the way back needs of a rendering."""
 
     gaussians: Gaussians  # those that get gradients
-    view: View  # of them
+    view: Projected  # of them
     camera: Camera
     settings: RasterSettings
     flags: np.ndarray
@@ -255,7 +255,7 @@ def trace(
 
 def blend(
     gaussians: Gaussians,
-    view: View,
+    view: Projected,
     camera: Camera,
     settings: RasterSettings,
     flags: np.ndarray,

@@ -98,7 +98,7 @@ class CpuPixelRegion:
             self, self._renderings, kept
         )
 
-    def _project(self, active: Gaussians) -> cpu.View:
+    def _project(self, active: Gaussians) -> cpu.Projected:
         """Project the active Gaussians into feature rows behind the frozen ones."""
         needed = self._frozen_count + len(active)
         if len(self._features) != needed:
@@ -106,10 +106,10 @@ class CpuPixelRegion:
             self._features = np.empty((needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW), np.float32)
             self._features[: self._frozen_count] = before[: self._frozen_count]
         n = len(active)
-        out = cpu.View(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
+        out = cpu.Projected(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
         return cpu.project(active, self.camera, self.settings, bool(self._flags[0]), out)
 
-    def _renew_layers(self, view: cpu.View, lists: TileLists) -> None:
+    def _renew_layers(self, view: cpu.Projected, lists: TileLists) -> None:
         """Make the layers of tiles whose active Gaussians have left the slab of depths that they were made for."""
         filled = np.flatnonzero(lists.stops > lists.starts)
         near, far = np.full((2, len(lists.tiles)), np.nan, np.float32)
@@ -155,7 +155,7 @@ class CpuPixelRegion:
         )
         return states
 
-    def _merge(self, view: cpu.View, lists: TileLists) -> TileLists:
+    def _merge(self, view: cpu.Projected, lists: TileLists) -> TileLists:
         """Frozen entries of the slabs and active ones in one list, by depth, frozen first where that is equal."""
         counts = (self._slab_stops - self._slab_starts) + (lists.stops - lists.starts)
         stops = np.cumsum(counts)

@@ -27,7 +27,7 @@ from .patchmatch import (
 )
 from .poisson import solve_hole
 from .regularity import continue_regularly, find_motions
-from .surface import Surface, coarser, supports, warps, whole_patches
+from .surface import TangentPlanes, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
 OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
@@ -67,7 +67,7 @@ def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
     settings: ExemplarSettings = ExemplarSettings(),
-    surface: Surface | None = None,  # what the picture shows
+    surface: TangentPlanes | None = None,  # what the picture shows
     unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
 ) -> Completion:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
@@ -132,7 +132,7 @@ class _Level:
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
     trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
-    surface: Surface | None
+    surface: TangentPlanes | None
     radius: int
     reach: int  # px from its centre to which a patch votes
 
@@ -141,7 +141,7 @@ def _prepared(
     channels: np.ndarray,
     hole: np.ndarray,
     unknown: np.ndarray,
-    surface: Surface | None,
+    surface: TangentPlanes | None,
     radius: int,
     reach: int,
     settings: ExemplarSettings,

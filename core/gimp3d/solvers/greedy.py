@@ -9,7 +9,7 @@ from numba import float32, int64
 from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import fma16, load16, splat16, sum16
 from .patches import lay_out
-from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
+from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, TangentPlanes, supports
 
 MOST_SOURCES = 4096  # patches that are tried for each place
 NO_SUPPORT = np.empty((0, 0), np.uint8)
@@ -22,7 +22,7 @@ def fill_inwards(
     hole: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
     radius: int,
-    surface: Surface | None = None,  # copy along its tangent planes
+    surface: TangentPlanes | None = None,  # copy along its tangent planes
     usable: np.ndarray | None = None,  # [H, W] bool, what may be copied then
 ) -> tuple[np.ndarray, np.ndarray]:
     """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.

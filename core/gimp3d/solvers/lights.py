@@ -25,7 +25,7 @@ SPREAD = 3.0  # standard deviations of colour beyond which more does not tell mo
 
 
 @dataclass(frozen=True)
-class Surface:
+class LitSurface:
     """A lit surface, on a grid."""
 
     shown: np.ndarray  # [H, W] bool, where it is known
@@ -48,7 +48,7 @@ class Shading:
     hues: np.ndarray  # [K, 3] differences of a channel's log less that of luminance
 
     @classmethod
-    def make(cls, surfaces: Sequence[Surface], levels: Sequence[int], bent: bool = True) -> Shading:
+    def make(cls, surfaces: Sequence[LitSurface], levels: Sequence[int], bent: bool = True) -> Shading:
         """`levels` are sides of blocks, in texels; `bent`: light may change over a surface as a quadratic does.
 
         A light nearby makes that, and it is no shadow. But wide shadows of the sky look like it: to measure those,
@@ -196,7 +196,7 @@ def _differences(shown: np.ndarray, levels: Sequence[int]) -> tuple[sparse.csr_m
     return sparse.vstack(parts).tocsr(), np.concatenate(kinds)
 
 
-def _besides(surface: Surface, bent: bool) -> np.ndarray:
+def _besides(surface: LitSurface, bent: bool) -> np.ndarray:
     """[T, B]: linear or quadratic in place, and quadratic in hue: light keeps it, so what goes with it is paint."""
     y, x = (2 * i[surface.shown] / max(surface.shown.shape) - 1 for i in np.indices(surface.shown.shape))
     colours = surface.colours[surface.shown]

@@ -23,7 +23,7 @@ from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
 from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
 from .patches import Patches, coordinates, lay_out
-from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Surface, supports
+from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, TangentPlanes, supports
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
@@ -69,7 +69,7 @@ def nearest_neighbour_field(
     source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
     penalty: np.ndarray | None = None,  # [H, W] float32 ≥ 0, added to the cost of each source
     settings: PatchMatchSettings = PatchMatchSettings(),
-    surface: Surface | None = None,  # what the picture shows
+    surface: TangentPlanes | None = None,  # what the picture shows
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most.
 
@@ -133,7 +133,7 @@ def refined(
     penalty: np.ndarray | None = None,  # [H, W] float32
     index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
-    surface: Surface | None = None,  # compare patches on its tangent planes
+    surface: TangentPlanes | None = None,  # compare patches on its tangent planes
     usable: np.ndarray | None = None,  # [H, W] bool, pixels that slanted patches may be copied from; None: not target
     reach: int = REACH,  # px, of the random search
     tree_sweeps: int | None = None,  # None: TREE_SWEEPS

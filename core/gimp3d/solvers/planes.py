@@ -21,7 +21,7 @@ LEAST_PIXELS = 10  # of the ring below which no plane is sought
 
 
 @dataclass(frozen=True)
-class Surface:
+class PlanarPart:
     """A part of the background that planes describe: one, or some that meet in a line."""
 
     disparity: np.ndarray  # [H, W] float64, continued over the whole image
@@ -33,7 +33,7 @@ class Surface:
 class PlanarSurfaces:
     """What of the hole's surroundings is planar."""
 
-    surfaces: tuple[Surface, ...]
+    surfaces: tuple[PlanarPart, ...]
     share: float  # of the ring that lies on them
     reason: str
 
@@ -55,7 +55,7 @@ def planar_surfaces(
     sky = ring & (disparity == 0)
     left = ring & ~sky
     rng = np.random.default_rng(0)
-    found = [Surface(np.zeros(disparity.shape), sky, 0)] if sky.any() else []
+    found = [PlanarPart(np.zeros(disparity.shape), sky, 0)] if sky.any() else []
     for _ in range(MOST):
         plane = _largest_plane(disparity, left, inlier, rng)
         if plane is None:
@@ -67,7 +67,7 @@ def planar_surfaces(
         left &= ~near
         if on.sum() < LEAST * ring.sum():
             break
-        found.append(Surface(plane, on))
+        found.append(PlanarPart(plane, on))
     share = float(sum(s.on.sum() for s in found) / max(1, ring.sum()))
     planes = sum(s.planes for s in found)
     reason = f"planar: {share:.0%} of the surroundings lie on {planes} plane{'s' if planes != 1 else ''}"
@@ -102,7 +102,7 @@ def _largest_plane(
     return best[0] * u + best[1] * v + best[2]
 
 
-def _joined(surfaces: list[Surface], inlier: float) -> list[Surface]:
+def _joined(surfaces: list[PlanarPart], inlier: float) -> list[PlanarPart]:
     """The surfaces, with those that meet made one."""
     for a, b in combinations(surfaces, 2):
         for meet in (np.maximum, np.minimum):
@@ -110,5 +110,5 @@ def _joined(surfaces: list[Surface], inlier: float) -> list[Surface]:
             kept = [(np.abs(joint - s.disparity) <= inlier * np.abs(s.disparity))[s.on].mean() for s in (a, b)]
             if min(kept) >= JUNCTION:
                 others = [s for s in surfaces if s is not a and s is not b]
-                return _joined([Surface(joint, a.on | b.on, a.planes + b.planes), *others], inlier)
+                return _joined([PlanarPart(joint, a.on | b.on, a.planes + b.planes), *others], inlier)
     return surfaces

@@ -31,7 +31,7 @@ MIXED, NEARER = 3, 0.05  # px beside something nearer by this share whose colour
 SKY = 1e4  # depth of what is infinitely far, in the greatest depths of the picture
 
 
-class Surface(NamedTuple):
+class TangentPlanes(NamedTuple):
     """Tangent planes; a named tuple, as kernels take it. Camera axes, scene units."""
 
     point: np.ndarray  # [H, W, 3] float32
@@ -43,13 +43,13 @@ class Surface(NamedTuple):
 
 
 _none = [np.empty((0, 0, n), np.float32) for n in (3, 3, 4, 4, 3)]
-NO_SURFACE = Surface(_none[0], _none[1], _none[2], _none[3], _none[4], np.empty((0, 0), bool))
+NO_SURFACE = TangentPlanes(_none[0], _none[1], _none[2], _none[3], _none[4], np.empty((0, 0), bool))
 
 
 def tangent_planes(
     disparity: np.ndarray,  # [H, W] 1/z, 0 = infinitely far or nothing
     K: np.ndarray,  # [3, 3]
-) -> Surface:
+) -> TangentPlanes:
     """The plane round each pixel that fits best, from windows round it and beside it: edges do not tilt planes."""
     valid = np.isfinite(disparity) & (disparity > 0)
     known = np.where(valid, disparity, 0.0).astype(np.float64)
@@ -62,10 +62,10 @@ def tangent_planes(
         return [a[top - first : top - first + STRIP] for a in _planes(known[first:last], valid[first:last], moved, far)]
 
     parts = parallel_map(strip, range(0, len(known), STRIP))
-    return Surface(*(np.concatenate(arrays) for arrays in zip(*parts)))
+    return TangentPlanes(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def _planes(known: np.ndarray, valid: np.ndarray, K: np.ndarray, far: float) -> Surface:
+def _planes(known: np.ndarray, valid: np.ndarray, K: np.ndarray, far: float) -> TangentPlanes:
     h, w = known.shape
     plane = _fitted(known, valid)
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
@@ -85,7 +85,7 @@ def _planes(known: np.ndarray, valid: np.ndarray, K: np.ndarray, far: float) -> 
     point, normal, frame, inverse, plane = (
         np.ascontiguousarray(a, np.float32) for a in (rays * depth[..., None], normal, frame, inverse, plane)
     )
-    return Surface(point, normal, frame, inverse, plane, ~_beside_nearer(known, plane))
+    return TangentPlanes(point, normal, frame, inverse, plane, ~_beside_nearer(known, plane))
 
 
 def _beside_nearer(disparity: np.ndarray, plane: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ def _choose(disparity, mx, my, md, bx, by, residual, plane):
                     plane[y, x, 0], plane[y, x, 1], plane[y, x, 2] = here, bx[a, b], by[a, b]
 
 
-def coarser(surface: Surface, level: int, shape: tuple[int, ...]) -> Surface:
+def coarser(surface: TangentPlanes, level: int, shape: tuple[int, ...]) -> TangentPlanes:
     """The planes at 1 / 2^level of the resolution; A does not change with the resolution."""
     if level == 0:
         return surface
@@ -166,10 +166,10 @@ def coarser(surface: Surface, level: int, shape: tuple[int, ...]) -> Surface:
     )
     arrays = [np.ascontiguousarray(a[rows[:, None], cols]) for a in surface]
     arrays[4][..., 1:] *= 2**level
-    return Surface(*arrays)
+    return TangentPlanes(*arrays)
 
 
-def supports(surface: Surface, places: np.ndarray, radius: int) -> np.ndarray:
+def supports(surface: TangentPlanes, places: np.ndarray, radius: int) -> np.ndarray:
     """[N, (2 radius + 1)²] uint8: which pixels of the patches at `places` ([N, 2]) lie on the centre's surface."""
     found = np.empty((len(places), (2 * radius + 1) ** 2), np.uint8)
     run_ranges(_support, len(places), places, surface.normal, surface.disparity, surface.clear, radius, found)
@@ -196,14 +196,14 @@ def _support(lo, hi, places, normal, disparity, clear, radius, found):
                 slot += 1
 
 
-def whole_patches(surface: Surface, centres: np.ndarray, radius: int) -> np.ndarray:
+def whole_patches(surface: TangentPlanes, centres: np.ndarray, radius: int) -> np.ndarray:
     """[H, W] bool: the centres whose patch lies on one surface."""
     kept = centres.copy()
     kept[centres] = supports(surface, np.argwhere(centres), radius).mean(1) >= WHOLE
     return kept
 
 
-def warps(surface: Surface, target: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+def warps(surface: TangentPlanes, target: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
     """[N, 4] float32, A row by row: from each target pixel's patch to the patch at its source."""
     inverse, frame = surface.inverse[target], surface.frame[rows[target], cols[target]]
     products = [frame[:, a] * inverse[:, b] + frame[:, a + 1] * inverse[:, b + 2] for a in (0, 2) for b in (0, 1)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..solvers.lights import Shading, Surface
+from ..solvers.lights import LitSurface, Shading
 from ..srgb import linear
 from .charts.plane import Plane
 from .ground import Ground
@@ -86,13 +86,13 @@ def taken_from(
 class Receiver:
     """A surface that a shadow may fall on, to be told from its colours."""
 
-    surface: Surface
+    surface: LitSurface
     points: np.ndarray  # [T, 3] of its known texels
     normal: np.ndarray  # [3]
 
     @classmethod
     def make(cls, ground: Ground) -> Receiver:
-        surface = Surface(ground.known, np.log(linear(ground.image) + DARK))
+        surface = LitSurface(ground.known, np.log(linear(ground.image) + DARK))
         return cls(surface, ground.points()[ground.known], ground.plane.normal)
 
     def halved(self) -> Receiver:
@@ -111,7 +111,7 @@ class Receiver:
             blocks(np.where(shown[..., None], v[:h, :w], 0)) / np.maximum(count, 1)
             for v in (self.surface.colours, points)
         )
-        return replace(self, surface=Surface(known, colours), points=points[known])
+        return replace(self, surface=LitSurface(known, colours), points=points[known])
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
-from ..priors.appearance import Painter, surroundings
+from ..priors.appearance import Painter, window_round_hole
 from ..priors.calls import Call
 from ..priors.pasting import paste_picture, resized, scaled
 from .propagate import Rule
@@ -98,9 +98,9 @@ def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: C
 
 def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> RefinedView:
     """One view; BadInput if the painter fails, a refused view if its answer does not agree."""
-    part = surroundings(_mask(view))
+    part = window_round_hole(_mask(view))
     painted, mask = view.image[part], _mask(view)[part]
-    left = view.reference[surroundings(view.reference_target)] if view.reference_target.any() else view.reference
+    left = view.reference[window_round_hole(view.reference_target)] if view.reference_target.any() else view.reference
     stitched, stitched_mask, beside = side_by_side(left, painted, mask)
     answer = resized(who.paint(stitched, stitched_mask, seed, call), stitched_mask.shape, who.answer)
     h, w = mask.shape

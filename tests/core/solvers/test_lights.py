@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gimp3d.solvers.lights import Shading, Surface
+from gimp3d.solvers.lights import LitSurface, Shading
 
 SIZE = 64
 Y, X = np.indices((SIZE, SIZE))
@@ -18,10 +18,10 @@ def blot(x: float, y: float, radius: float) -> np.ndarray:
     return np.exp(-(((X - x) ** 2 + (Y - y) ** 2) / (2 * radius**2)))
 
 
-def painted(darkness: np.ndarray, rng: np.random.Generator, noise: float = 0.03) -> Surface:
+def painted(darkness: np.ndarray, rng: np.random.Generator, noise: float = 0.03) -> LitSurface:
     """A grey surface with speckles, in shadow."""
     luminance = np.log(0.5) + noise * rng.standard_normal((SIZE, SIZE)) + np.log(1 - darkness)
-    return Surface(np.ones((SIZE, SIZE), bool), np.repeat(luminance[..., None], 3, axis=2))
+    return LitSurface(np.ones((SIZE, SIZE), bool), np.repeat(luminance[..., None], 3, axis=2))
 
 
 @given(st.integers(0, 2**31), st.floats(0.1, 0.8), st.floats(0.0, 0.6))
@@ -38,7 +38,7 @@ def test_light_that_changes_evenly_is_no_shadow() -> None:
     rng = np.random.default_rng(1)
     surface = painted(np.zeros((SIZE, SIZE)), rng)
     slope = 0.4 * X / SIZE + 0.3 * (Y / SIZE) ** 2
-    lit = Shading.make([Surface(surface.shown, surface.colours + slope[..., None])], LEVELS)
+    lit = Shading.make([LitSurface(surface.shown, surface.colours + slope[..., None])], LEVELS)
     strengths, _, _ = lit.fit(blot(32, 32, 8).reshape(-1, 1))
     assert strengths[0] < 0.03
 
@@ -49,9 +49,9 @@ def test_what_goes_with_hue_is_paint() -> None:
     red = blot(32, 32, 5) + blot(12, 12, 5) + blot(52, 14, 5) + blot(14, 50, 5)
     surface = painted(np.zeros((SIZE, SIZE)), rng, 0.01)
     colours = surface.colours - 0.6 * red[..., None] * np.array([0.2, 1.2, 1.2])
-    lit = Shading.make([Surface(surface.shown, colours)], LEVELS)
+    lit = Shading.make([LitSurface(surface.shown, colours)], LEVELS)
     shape = blot(32, 32, 5).reshape(-1, 1)
-    grey = Shading.make([Surface(surface.shown, np.repeat(colours.mean(-1, keepdims=True), 3, axis=2))], LEVELS)
+    grey = Shading.make([LitSurface(surface.shown, np.repeat(colours.mean(-1, keepdims=True), 3, axis=2))], LEVELS)
     assert lit.fit(shape)[0][0] < 0.5 * grey.fit(shape)[0][0]
 
 
@@ -60,7 +60,7 @@ def test_tints_are_told_channel_by_channel() -> None:
     shape, tint = blot(32, 32, 7), np.array([1.15, 1.0, 0.85])
     noise = 0.01 * rng.standard_normal((SIZE, SIZE, 1))
     colours = np.log(0.5) + noise + np.log(1 - 0.5 * shape[..., None] * tint)
-    lit = Shading.make([Surface(np.ones((SIZE, SIZE), bool), colours)], LEVELS)
+    lit = Shading.make([LitSurface(np.ones((SIZE, SIZE), bool), colours)], LEVELS)
     strengths, _, _ = lit.fit(shape.reshape(-1, 1))
     np.testing.assert_allclose(strengths[0] * lit.tints(shape.reshape(-1, 1), strengths)[0], 0.5 * tint, atol=0.04)
 
@@ -70,7 +70,7 @@ def test_texels_that_are_not_known_say_nothing() -> None:
     surface = painted(0.5 * blot(32, 32, 6), rng)
     shown = surface.shown & ((X - 32) ** 2 + (Y - 32) ** 2 > 16)
     spoilt = np.where(shown[..., None], surface.colours, rng.standard_normal((SIZE, SIZE, 3)))
-    lit = Shading.make([Surface(shown, spoilt)], LEVELS)
+    lit = Shading.make([LitSurface(shown, spoilt)], LEVELS)
     assert lit.fit(blot(32, 32, 6)[shown][:, None])[0][0] == pytest.approx(0.5, abs=0.05)
 
 
@@ -89,6 +89,6 @@ def test_hardly_known_surfaces_are_no_error(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     shown = np.zeros((SIZE, SIZE), bool)
     shown.flat[rng.choice(SIZE * SIZE, count, replace=False)] = True
-    lit = Shading.make([Surface(shown, rng.normal(size=(SIZE, SIZE, 3)))], LEVELS)
+    lit = Shading.make([LitSurface(shown, rng.normal(size=(SIZE, SIZE, 3)))], LEVELS)
     strengths, besides, loss = lit.fit(blot(32, 32, 8)[shown][:, None])
     assert 0 <= strengths[0] <= 1 and np.isfinite(besides).all() and np.isfinite(loss)

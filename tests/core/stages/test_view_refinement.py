@@ -10,7 +10,7 @@ import pytest
 from pictures import disc, error, scenery
 
 from gimp3d.errors import BadInput
-from gimp3d.priors.appearance import Painter, surroundings
+from gimp3d.priors.appearance import Painter, window_round_hole
 from gimp3d.priors.calls import Call
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
@@ -33,7 +33,7 @@ ASKED = HOLE.copy()
 ASKED[:55] = False
 
 
-PANEL = surroundings(ASKED)  # what of the view the painter sees
+PANEL = window_round_hole(ASKED)  # what of the view the painter sees
 
 
 def painter(change, seen: list | None = None) -> Painter:

@@ -16,7 +16,7 @@ from ...solvers.planes import RING
 from ...solvers.poisson import solve_poisson
 from ..masks import ViewMasks
 from .evidence import AGREEMENT, DepthEvidence, gather_depth_evidence
-from .fill import HOLD_OUT, DepthSettings, Surroundings, choose_plan, fill, hold_out_miss, surroundings
+from .fill import HOLD_OUT, DepthSettings, Measured, choose_plan, fill, hold_out_miss, measure
 from .layers import AROUND, BAND, distance_to, without_front
 from .prior import PriorFit, fit_prior
 
@@ -130,7 +130,7 @@ def complete_disparity(
     if evidence is not None:
         usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
         weight[usable], scene[usable] = evidence.weight[usable], evidence.disparity[usable]
-    around = surroundings(scene, trusted, hole, weight, settings)
+    around = measure(scene, trusted, hole, weight, settings)
     guide, fit, on_line = None, PriorFit(0.0, 0.0, 1.0, ""), trusted
     if prior is not None:
         fit = fit_prior(scene, around.measured, hole, prior, settings, on_ring=bool(around.touching.any()))
@@ -144,10 +144,10 @@ def complete_disparity(
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = bounds(part, RING + 1) if near else np.s_[:, :]
         inside, evident = part[window], (weight * part)[window]
-        alone = surroundings(scene[window], trusted[window], inside, evident, settings)
+        alone = measure(scene[window], trusted[window], inside, evident, settings)
         guided = None
         if guide is not None:
-            guided = surroundings(scene[window], on_line[window], inside, evident, settings, guide[window])
+            guided = measure(scene[window], on_line[window], inside, evident, settings, guide[window])
         own = replace(settings, surface="harmonic") if part.sum() <= settings.small_part else settings
         found = _completed_part(alone, guided, fit, own, first=not done)
         result[window][inside], trust[window][inside] = found.disparity[inside], found.trust[inside]
@@ -174,7 +174,7 @@ class _Part:
 
 
 def _completed_part(
-    alone: Surroundings, guided: Surroundings | None, fit: PriorFit, settings: DepthSettings, first: bool
+    alone: Measured, guided: Measured | None, fit: PriorFit, settings: DepthSettings, first: bool
 ) -> _Part:
     """What is round one part continued into it, with the prior as far as that is believed."""
     if guided is None:
@@ -205,7 +205,7 @@ def _completed_part(
     return _Part(filled, share * sure * _trust(around, missed), pixels, min(share, sure), believed, clamped, notes)
 
 
-def _clamped(filled: np.ndarray, around: Surroundings) -> tuple[np.ndarray, int]:
+def _clamped(filled: np.ndarray, around: Measured) -> tuple[np.ndarray, int]:
     """The disparities kept to the ring's range, and how many of the hole's were not in it."""
     ring = around.measured & (around.distance <= BAND)
     beside = around.disparity[ring if ring.any() else around.measured]
@@ -221,8 +221,8 @@ def _as_far_as_believed(
     filled: np.ndarray,  # [H, W] the hole's disparity with the prior
     missed: float,  # by it on the hold-out band
     fit: PriorFit,
-    guided: Surroundings,
-    alone: Surroundings,  # without the prior
+    guided: Measured,
+    alone: Measured,  # without the prior
     settings: DepthSettings,
 ) -> tuple[np.ndarray, float]:
     """The hole with as much of the prior as its fit and its miss on a hold-out band allow, and how much that is.
@@ -262,7 +262,7 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     return [*large, rest] if rest.any() else large
 
 
-def _trust(around: Surroundings, missed: float) -> np.ndarray:
+def _trust(around: Measured, missed: float) -> np.ndarray:
     """[H, W]: each pixel's confidence, from the miss on a hold-out band and the distance to what is measured."""
     far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
     expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / HOLD_OUT)

@@ -11,7 +11,7 @@ import scipy.ndimage
 
 from ...errors import IllPosed
 from ...schema import Many, Positive, Signed
-from ...solvers.planes import INLIER, RING, Surface, planar_surfaces
+from ...solvers.planes import INLIER, RING, PlanarPart, planar_surfaces
 from ...solvers.poisson import solve_poisson
 from ...solvers.thin_plate import UNKNOWNS, thin_plate
 from .layers import LEAST_LAYER, STEP, background_rim, distance_to, divided, separated
@@ -40,7 +40,7 @@ class DepthSettings:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class Measured:
     """A hole and what is measured round and in it."""
 
     disparity: np.ndarray  # [H, W] float64: the scene's on the rim, the evidence's in the hole
@@ -61,17 +61,17 @@ class Surroundings:
         return (self.rim & scipy.ndimage.binary_dilation(self.hole)) | (self.weight > 0)
 
 
-def surroundings(
+def measure(
     disparity: np.ndarray,  # [H, W] float64
     known: np.ndarray,  # [H, W] bool
     hole: np.ndarray,  # [H, W] bool
     weight: np.ndarray,  # [H, W], 0 off the hole
     settings: DepthSettings,
     guide: np.ndarray | None = None,
-) -> Surroundings:
+) -> Measured:
     """What bounds a hole, occluders left out (`background_rim`)."""
     rim = background_rim(disparity, known, hole, settings.layer_step)
-    return Surroundings(disparity, rim, hole, weight, distance_to(hole), guide)
+    return Measured(disparity, rim, hole, weight, distance_to(hole), guide)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class _Layer:
     """A surface that goes on behind the object."""
 
     on: np.ndarray  # [H, W] bool, measured pixels that lie on it
-    surface: Surface | None = None  # its planes, if it has some
+    surface: PlanarPart | None = None  # its planes, if it has some
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Plan:
 
 
 def choose_plan(
-    around: Surroundings,
+    around: Measured,
     settings: DepthSettings,
     insist: bool = True,  # on planes, if the settings do
 ) -> Plan:
@@ -133,12 +133,12 @@ def choose_plan(
     return plain
 
 
-def _layers(around: Surroundings, surfaces: tuple[Surface, ...], split: bool, step: float) -> tuple[_Layer, ...]:
+def _layers(around: Measured, surfaces: tuple[PlanarPart, ...], split: bool, step: float) -> tuple[_Layer, ...]:
     """The planar surfaces, the sky, and what of the surroundings lies on none of them, parted at steps."""
     d = around.disparity
     sky = around.measured & (d == 0)
     if not surfaces and (sky & around.touching).any():
-        surfaces = (Surface(np.zeros(d.shape), sky, 0),)
+        surfaces = (PlanarPart(np.zeros(d.shape), sky, 0),)
     index = np.where(around.measured, len(surfaces), -1)
     for k, surface in reversed(list(enumerate(surfaces))):
         index[around.measured & (np.abs(d - surface.disparity) <= step * np.maximum(d, surface.disparity))] = k
@@ -151,7 +151,7 @@ def _layers(around: Surroundings, surfaces: tuple[Surface, ...], split: bool, st
     return tuple(layers)
 
 
-def fill(around: Surroundings, plan: Plan, settings: DepthSettings) -> np.ndarray:
+def fill(around: Measured, plan: Plan, settings: DepthSettings) -> np.ndarray:
     """Disparity [H, W] float64 of the hole, NaN where nothing says anything."""
     seeds = np.full(around.hole.shape, -1)
     touching = around.touching
@@ -173,7 +173,7 @@ def fill(around: Surroundings, plan: Plan, settings: DepthSettings) -> np.ndarra
     return filled
 
 
-def _continued(around: Surroundings, layer: _Layer, own: np.ndarray, kind: str, settings: DepthSettings) -> np.ndarray:
+def _continued(around: Measured, layer: _Layer, own: np.ndarray, kind: str, settings: DepthSettings) -> np.ndarray:
     """[H, W]: a layer without planes in its part of the hole. With a guide, its error is what is continued."""
     guide = np.zeros(own.shape) if around.guide is None else around.guide
     values = around.disparity - guide
@@ -196,7 +196,7 @@ def _continued(around: Surroundings, layer: _Layer, own: np.ndarray, kind: str, 
 
 
 def _deviation(
-    around: Surroundings,
+    around: Measured,
     layer: _Layer,
     on: np.ndarray,  # [H, W] bool, what of the layer lies on the surface
     surface: np.ndarray,  # [H, W] disparity
@@ -216,7 +216,7 @@ def _deviation(
     return np.nan_to_num(solve_poisson(own, rim, average, weight=around.weight * layer.on, anchor=average).values)
 
 
-def hold_out_miss(around: Surroundings, plan: Plan, settings: DepthSettings, where: np.ndarray) -> float:
+def hold_out_miss(around: Measured, plan: Plan, settings: DepthSettings, where: np.ndarray) -> float:
     """Mean relative error of a plan's best pixels on a hold-out band, when only what lies farther out is told.
 
     Evidence does not count, since the band has it beside it. NaN where too little is left to tell.
