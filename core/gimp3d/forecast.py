@@ -14,23 +14,25 @@ ON_VIEWS = ("reference", "depth")  # … and of the latter
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 STAGES = {
-    "read": (0.321, 0.129, 0.178),
-    "masks": (0.565, 0.159, 0.303),
-    "surfaces": (0.651, 0.047, 0.026),
-    "light": (1.677, 0.03, 0.0),
+    "read": (0.244, 0.112, 0.142),
+    "masks": (0.549, 0.15, 0.303),
+    "exposure": (0.038, 0.021, 0.029),
+    "surfaces": (0.631, 0.052, 0.022),
+    "light": (1.713, 0.035, 0.0),
     "lift": (0.0, 0.0, 0.0),
-    "charts": (0.215, 0.19, 0.133),
-    "reference": (0.391, 0.021, 0.0),
-    "depth": (0.311, 0.069, 0.0),
-    "appearance": (0.11, 0.004, 0.0),
-    "mapping": (0.026, 0.012, 0.001),
-    "propagate": (0.336, 0.069, 0.024),
-    "settle": (0.057, 0.022, 0.031),
-    "verdict": (0.274, 0.048, 0.044),
+    "charts": (0.175, 0.195, 0.15),
+    "reference": (0.376, 0.033, 0.0),
+    "depth": (0.165, 0.06, 0.0),
+    "appearance": (0.51, 0.007, 0.0),
+    "seed": (0.001, 0.005, 0.003),
+    "mapping": (0.029, 0.012, 0.001),
+    "propagate": (0.15, 0.069, 0.007),
+    "settle": (0.052, 0.021, 0.031),
+    "verdict": (0.26, 0.046, 0.049),
 }
-STEP = (0.00063, 0.04108)  # s of a step of refinement: constant, for each million pixels of a view
-PAPER_STEP = (0.00366, 0.11637)  # the same for the paper's, which move everything
-MEMORY_MB = (278.0, 71.0, 633.0)  # constant, for each million pixels of all views, for each million Gaussians
+STEP = (0.00044, 0.03595)  # s of a step of refinement: constant, for each million pixels of a view
+PAPER_STEP = (0.0, 0.14118)  # the same for the paper's, which move everything
+MEMORY_MB = (318.0, 57.0, 316.0)  # constant, for each million pixels of all views, for each million Gaussians
 
 
 @dataclass(frozen=True)
