@@ -22,10 +22,10 @@ def test_edges_are_continued_within_two_pixels(name: str) -> None:
     assert edge_error(filled(name), *PICTURES[name]) < 2
 
 
-@pytest.mark.parametrize("name", ["bricks", "two mats and wood"])
+@pytest.mark.parametrize("name", ["bricks", "book row", "corner"])  # of those in which it matters at all
 def test_the_seed_hardly_matters(name: str) -> None:
     truth, hole = PICTURES[name]
-    assert np.std([psnr(filled(name, seed), truth, hole) for seed in range(4)]) < 0.5
+    assert np.std([psnr(filled(name, seed), truth, hole) for seed in range(4)]) < 0.3
 
 
 def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
