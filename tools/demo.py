@@ -65,7 +65,7 @@ def remove_the_vase(out: Path) -> None:
     box, region = bpy.context.object, json.loads((SCENE / "roi.json").read_text())
     box.location, box.scale = region["center"], region["size"]
     bpy.ops.gimp3d.import_cameras(filepath=str(SCENE / "transforms.json"))
-    say("removing the vase (the first run compiles the kernels, some seconds)")
+    say("removing the vase (the first run compiles the kernels, about a minute)")
     bpy.ops.gimp3d.remove_object()
     bpy.ops.gimp3d.export_ply(filepath=str(out / "out.ply"))
     report = Path(bpy.context.scene.gimp3d.last_report).parent
