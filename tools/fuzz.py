@@ -1,8 +1,8 @@
 """Throws changed files at every reader, for as long as it is let; goes on where it stopped. Run by `make fuzz`.
 
-With atheris, libFuzzer's engine for Python, changes are guided by the lines they reach, and what reaches new ones is
-kept in OUT/corpus; without it, cases are made by their numbers alone. Either way OUT/counts.json holds how many cases
-each reader has had, until readers of texts and numbers have had --in-memory and those of files --in-files.
+With atheris, libFuzzer's engine for Python, half of the cases start from what reached new lines, which is kept in
+OUT/corpus; the others, and all without atheris, start from files that a reader takes. OUT/counts.json holds how many
+cases each reader has had, until readers of texts and numbers have had --in-memory and those of files --in-files.
 
     python tools/fuzz.py [--out build/fuzz] [--in-memory 1000000] [--in-files 100000] [--seconds S] [--only NAME]
 
@@ -35,7 +35,8 @@ if GUIDED:
 else:
     from readers import READERS, Reader, case, mutated
 
-AT_ONCE = {False: 100_000, True: 5_000}  # cases between two looks at the clock, of readers in memory and of files
+AT_ONCE = {False: 100_000, True: 25_000}  # cases of a process, whose start takes 4 s: of readers in memory, of files
+LONGEST = 2  # times the largest seed: what grows without end gets slow
 SLOWEST, LARGEST = 20, 4096  # seconds and MiB that a case may take
 
 
@@ -103,11 +104,13 @@ def run_chunk(reader: Reader, out: Path, size: int) -> int:
 
     def changed(data: bytes, most: int, seed: int) -> bytes:
         rng = random.Random(seed)
+        start = data if data and rng.random() < 0.5 else rng.choice(seeds)
         if rng.random() < 0.3:
-            return atheris.Mutate(data, most)
-        return mutated(data or rng.choice(seeds), rng, reader.is_json)[:most]
+            return atheris.Mutate(start, most)
+        return mutated(start, rng, reader.is_json)[:most]
 
-    words = f"-runs={size} -seed={done + 1} -timeout={SLOWEST} -rss_limit_mb={LARGEST} -max_len=65536"
+    words = f"-runs={size} -seed={done + 1} -timeout={SLOWEST} -rss_limit_mb={LARGEST}"
+    words += f" -max_len={LONGEST * max(map(len, seeds))}"
     options = [sys.argv[0], *words.split(), f"-artifact_prefix={found}/{reader.name}-", str(corpus)]
     atheris.Setup(options, lambda data: reader.check(data) and None, custom_mutator=changed)
     atheris.Fuzz()  # ends the process
