@@ -224,10 +224,10 @@ def write_masks(
         views = {v.id: v for v in behind.views}
         charts, lit = charts_to_paint(behind.charts, behind.views), behind.lit
     if pictures:
-        write_json(pictures / "proposed.json", _proposed(found.proposed, frame))
+        write_json(pictures / "proposed.json", frame.proposed_back(found.proposed))
         write_json(pictures / "light.json", {"shadow": lit.shadow, "reflection": lit.reflection})
         if all(c.split == "train" for c in written):
-            write_charts(pictures / "charts", _charts_back(charts, frame))
+            write_charts(pictures / "charts", frame.charts_back(charts))
     for camera in written:
         view = views.get(camera.id)
         name = output_name(camera.id)
@@ -331,7 +331,7 @@ def run_removal(
         shadow,
         allow_network,
     )
-    result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
+    result = replace(result, charts=frame.charts_back(result.charts), proposed=frame.proposed_back(result.proposed))
     summary = summary_of(job, settings, file, result, warnings, time.perf_counter() - start)
     _write_beside(job, folder, scene, views, result, summary)
     write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
@@ -404,16 +404,6 @@ def _load_views(
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
-
-
-def _proposed(proposed: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    return {**proposed, "box": frame.box_back(proposed["box"])} if proposed else proposed
-
-
-def _charts_back(charts: Sequence[Chart], frame: Frame) -> tuple[Chart, ...]:
-    """Charts whose cameras are in the file's frame."""
-    back = frame.cameras_back([c.camera for c in charts])
-    return tuple(replace(chart, camera=camera) for chart, camera in zip(charts, back))
 
 
 def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
