@@ -361,6 +361,8 @@ BAD = {  # the command, its exit code, and what its error says
     "negative margin": (f"{REMOVE} --set masks.margin=-1", 2, "masks.margin: must be from 0 to 1000, got -1"),
     "NaN for a setting": (f"{REMOVE} --set masks.selection.support=nan", 2, "a finite number"),
     "a huge setting": (f"{REMOVE} --set masks.margin=1000000000", 2, "from 0 to 1000"),
+    "charts of no pixels": (f"{REMOVE} --set charts.largest=0", 2, "charts.largest: must be from 1 to 1000, got 0"),
+    "surroundings of no cells": (f"{REMOVE} --set surroundings.cells=0", 2, "no setting"),
     "no samples": (f"{REMOVE} --set reference.samples=0", 2, "from 1 to"),
     "an unknown word for a setting": (f"{REMOVE} --set masks.mode=some", 2, "need or paper expected"),
     "a file for a job": ("remove --job roi.json", 2, "job.json"),
