@@ -137,6 +137,18 @@ def test_a_job_runs_alone_moves_and_resumes(
     assert read_json(moved / "summary.json")["counts"]["added"] > 0
 
 
+def test_stages_that_were_emptied_or_exchanged_run_again(scene_folder: Path, tmp_path: Path) -> None:
+    """A full disk leaves files of 0 bytes; they ended the next run with EOFError."""
+    job = tmp_path / "job"
+    remove(scene_folder, tmp_path / "first.ply", "--job", job)
+    stages = sorted((job / "stages").glob("*.npz"))
+    assert len(stages) > 5
+    for k, stage in enumerate(stages):
+        stage.write_bytes(b"" if k % 2 else stages[0].read_bytes()[:-1])
+    remove(scene_folder, tmp_path / "second.ply", "--job", job, "--resume")
+    assert (tmp_path / "second.ply").read_bytes() == (tmp_path / "first.ply").read_bytes()
+
+
 def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -> None:
     reference = cameras()[0]
     true = render_bytes(truth(), reference)
