@@ -38,7 +38,6 @@ from gimp3d.io.images import load_view, read_image
 from gimp3d.io.ply import _parse_header, write_gaussians
 from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d.priors import servers
-from gimp3d.priors.calls import Call
 from gimp3d.priors.monodepth import _from_file
 from gimp3d.priors.onnx import read_model
 from gimp3d.priors.servers import _Asked, _Automatic, _Comfy, _said, _Server, _workflow
@@ -221,7 +220,7 @@ class Answers(_Server):
     """A server that says the same to every question of a kind, until it has been asked often."""
 
     def __init__(self, document: Any) -> None:
-        super().__init__("http://localhost:1", Call())
+        self.option, self.url, self.seconds = "x", "http://localhost:1", 1.0
         self.document, self.left = document, 9
 
     def _ask(self, path: str, *_: Any) -> bytes:
