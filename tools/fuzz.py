@@ -15,9 +15,11 @@ import argparse
 import hashlib
 import importlib.util
 import json
+import os
 import random
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -54,6 +56,13 @@ def main() -> int:
     given = parser.parse_args()
     if given.chunk:
         return run_chunk(READERS[given.only], given.out, given.chunk)
+    # atheris ends a process without letting it clean up
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
+        return run_all(given, {**os.environ, "TMPDIR": place})
+
+
+def run_all(given: argparse.Namespace, environment: dict[str, str]) -> int:
+    """All readers in turn, each in processes of its own, until they have had their cases or the time is over."""
     end, failed = time.monotonic() + given.seconds, False
     names = [given.only] if given.only else list(READERS)
     while names and time.monotonic() < end:
@@ -66,7 +75,7 @@ def main() -> int:
             size = min(AT_ONCE[READERS[name].needs_files], most - done["cases"])
             start = time.monotonic()
             command = [sys.executable, __file__, "--out", str(given.out), "--only", name, "--chunk", str(size)]
-            ran = subprocess.run(command, capture_output=True, text=True, errors="replace")
+            ran = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace")
             if ran.returncode:
                 print(f"{name}: found something\n{ran.stdout[-2000:]}{ran.stderr[-1000:]}", flush=True)
                 names.remove(name)

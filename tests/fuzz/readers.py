@@ -9,6 +9,7 @@ import atexit
 import gzip
 import json
 import math
+import os
 import random
 import shutil
 import sys
@@ -79,8 +80,8 @@ class Reader:
 
 @cache
 def place() -> Path:
-    shared = Path("/dev/shm")
-    folder = tempfile.mkdtemp(prefix="gimp3d-fuzz-", dir=shared if shared.is_dir() else None)
+    in_memory = "TMPDIR" not in os.environ and Path("/dev/shm").is_dir()
+    folder = tempfile.mkdtemp(prefix="gimp3d-fuzz-", dir="/dev/shm" if in_memory else None)
     atexit.register(shutil.rmtree, folder, True)
     return Path(folder)
 
