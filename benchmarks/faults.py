@@ -126,7 +126,7 @@ def fuzzed(folder: Path) -> Iterator[list[object]]:
         what = (
             f"changed files, `make fuzz`: {len(done)} readers {where}, {min(c['cases'] for c in done.values()):,} each"
         )
-        lost = sum(f.startswith(name) for f in found for name in done)
+        lost = sum(f.startswith(f"{name}-") for f in found for name in done)
         yield [what, "read or refused", f"{cases:,}", lost, f"{seconds:.0f}"]
 
 

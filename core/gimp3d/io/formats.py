@@ -292,16 +292,15 @@ def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     """A picture [H, W, 4] uint8, RGBA, of at most so many pixels."""
     try:
         import cv2
+
+        from .images import decoded
     except ImportError:
         raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
     if announced_pixels(data) > most:
         raise BadInput(f"{path}: a picture of the SOG scene is far larger than its count needs")
-    try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except cv2.error:
-        picture = None
-    if picture is None or picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
-        raise BadInput(f"{path}: a picture of the SOG scene cannot be read")
+    picture = decoded(data, f"{path}: a part of the SOG scene")
+    if picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
+        raise BadInput(f"{path}: a picture of the SOG scene is of another kind")
     if picture.shape[2] == 3:
         return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
     return cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA)
