@@ -6,6 +6,7 @@ Prints the table of docs/reliability.md and writes it to OUT/reliability.md. Run
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -83,10 +84,13 @@ def main() -> int:
     parser.add_argument("--fuzz", type=Path, default=ROOT / "build" / "fuzz")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
+    # A shell's background job ignores Ctrl-C, and so would every program that is started here and interrupted.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     lines, wrong = [], 0
     for row in ROWS:
         say(row.what)
         tried, lost, seconds = run(row, given.out / "results.xml")
+        say(f"{tried:,} tried, {lost} lost, {seconds:.0f} s")
         wrong += lost
         lines.append([row.what, row.holds, f"{tried:,}", lost, f"{seconds:.0f}"])
     head = ("tried", "what has to hold", "number", "lost", "seconds")
