@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
-	bench-ablation bench-propagate bench-harmonics bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
+	bench-ablation bench-propagate bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
 	bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -54,7 +54,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability
+bench: bench-raster bench-surface bench-poisson bench-depth bench-nnf bench-inpaint bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 bench-raster: $(READY)
@@ -92,9 +92,6 @@ bench-light: $(READY)
 # one of the rules about the object's light switched off: make bench-light-rules RULE="hue is no paint"
 bench-light-rules: $(READY)
 	$(BIN)/python -m benchmarks.light $(DATA) --skip-removals --without "$(or $(RULE),a light need not beat chance)"
-
-bench-harmonics: $(READY)
-	$(BIN)/python -m benchmarks.harmonics
 
 # presets, ablations and baselines: half an hour
 bench-pareto: $(READY)

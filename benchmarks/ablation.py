@@ -65,7 +65,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "no view dependence": (("seed.sh_degree", 0),),
     "degree 1": (("seed.sh_degree", 1),),
     "degree 3": (("seed.sh_degree", 3),),
-    "views' common offset is fitted": (("seed.harmonics.offset", False),),
     "not refined": (("refine.steps", 0),),
     "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
     # the fill

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from .schema import Seed, Share
-from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
@@ -56,7 +55,7 @@ PRESETS: dict[str, RemovalSettings] = {
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
         mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(largest=1, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
+        seed=SeedSettings(largest=1, corrections=0, sh_degree=3),
         refine=RefineSettings(steps=3000, patience=120),
         shadow="off",
         use_evidence=False,

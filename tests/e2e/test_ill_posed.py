@@ -32,7 +32,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import footprint, render
-from gimp3d.solvers.harmonics import sh_basis
+from gimp3d.sh import sh_basis
 from gimp3d.stages.mapping import mapping_field
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.reference import choose_reference
