@@ -75,8 +75,8 @@ bench-ablation: $(READY)
 
 # those of the way from the reference into the other views
 bench-propagate: $(READY)
-	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate --rules "the warp" \
-		retargeting "paper's sampling" "paper's blend" "in the picture"
+	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate \
+		--rules "the warp" "paper's sampling" "paper's blend"
 
 # 128 removals: an hour, so not part of bench
 bench-references: $(READY)

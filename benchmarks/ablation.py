@@ -55,10 +55,8 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "a membrane behind the object": (("depth.surface", "harmonic"),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),
-    "no retargeting": (("propagate.retarget", 0),),
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
-    "patches in the picture, not on the surface": (("mapping.geometry", False),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),
     "colours as seeded": (("seed.corrections", 0),),

@@ -53,7 +53,6 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
-        mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(largest=1, corrections=0, sh_degree=3),
         refine=RefineSettings(steps=3000, patience=120),

@@ -496,7 +496,7 @@ def assert_as_before(folder: Path) -> None:
     assert {p.name for p in folder.iterdir()} == {"scene.ply", "cameras.json", "roi.json", "out.ply"}
 
 
-@pytest.mark.parametrize("stage", ["read", "masks", "charts", "appearance", "seed", "mapping", "propagate", "settle"])
+@pytest.mark.parametrize("stage", ["read", "masks", "charts", "appearance", "seed", "propagate", "settle"])
 def test_files_are_as_before_a_run_that_is_cancelled(
     stage: str, remove: Remove, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -540,7 +540,7 @@ def test_a_crashed_run_goes_on_where_it_was(remove: Remove, monkeypatch: pytest.
     (folder / "summary.json").unlink()
     old_result(folder)
     job = folder.parent / "job"
-    crash = "import os, gimp3d.filling as f; f.map_reference = lambda *a, **b: os._exit(9)"
+    crash = "import os, gimp3d.filling as f; f.paint_views = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
     monkeypatch.setattr(pipeline, "find_masks", again)

@@ -25,6 +25,7 @@ STEADY, STEADIER = 0.01**2, 0.03**2  # SSIM's C1 and C2, by which dark and flat 
 SSIM = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
 NORMAL, DISTORTION = 0.05, 10.0  # weights of normal consistency and depth distortion, surfels only (Huang 2024)
 MARGIN = 4  # px of known picture round the target that counts as well: no visible seam
+PAINTED = 0.5  # how far a painted pixel is believed, beside one of a photo
 HELD_OUT = 8  # every so many views is not learned from; it says when to stop
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 # Its learning rates: 3DGS's, those of shapes lower as there are few steps; of means in the Gaussians' median size.
@@ -52,27 +53,14 @@ class Observation:
     weight: np.ndarray  # [H, W] float32 ≥ 0, how far each pixel is trusted
 
 
-# How far a painted pixel is believed, by the rule that gave its colour.
-TRUST = {
-    Rule.EVIDENCE: 1.0,
-    Rule.REFINED: 0.5,
-    Rule.OWN_PIXELS: 0.5,
-    Rule.RETARGETED: 0.5,
-    Rule.OTHER_VIEW: 0.25,
-    Rule.REFERENCE: 0.25,
-}
-
-
 def observed(
     camera: Camera,
     image: np.ndarray,  # [H, W, 3] uint8, the painted view
     rules: np.ndarray,  # [H, W] uint8, see Rule
 ) -> Observation:
-    """What a painted view tells: its hole, each pixel as far as its rule is believed."""
-    weights = np.zeros(max(Rule) + 1, np.float32)
-    for rule, weight in TRUST.items():
-        weights[rule] = weight
-    return Observation(camera, image, rules != Rule.UNTOUCHED, weights[rules])
+    """What a painted view tells of its hole."""
+    weight = np.where(rules == Rule.EVIDENCE, 1.0, PAINTED) * ~np.isin(rules, (Rule.UNTOUCHED, Rule.UNREACHED))
+    return Observation(camera, image, rules != Rule.UNTOUCHED, weight.astype(np.float32))
 
 
 @dataclass(frozen=True)
