@@ -6,7 +6,7 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
-	bench-ablation bench-propagate bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
+	bench-ablation bench-propagate bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
 	bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
@@ -54,7 +54,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-nnf bench-inpaint bench-pareto bench-stability
+bench: bench-raster bench-surface bench-poisson bench-depth bench-inpaint bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 bench-raster: $(READY)
@@ -130,9 +130,6 @@ $(OTHERS)/.ready:
 	$(OTHERS)/bin/python -m pip install --quiet 'numpy<2' scikit-image==0.26.0 imageio
 	$(OTHERS)/bin/python -m pip install --quiet PyPatchMatch==2.2.0 || echo "PyPatchMatch cannot be installed here; it is left out"
 	@touch $@
-
-bench-nnf: $(READY) $(OTHERS)/.ready
-	$(BIN)/python -m benchmarks.nnf --others $(OTHERS)/bin/python
 
 bench-inpaint: $(READY) $(OTHERS)/.ready
 	$(BIN)/python -m benchmarks.fill --only photographs --out build/bench_inpaint --others $(OTHERS)/bin/python

@@ -18,7 +18,6 @@ from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks
 
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
-MOST_EXTRA = 8  # further references that a plan looks ahead
 # Where the hidden surface is, about: coarse and fast.
 PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)
 
@@ -47,7 +46,6 @@ class ReferenceChoice:
 
     camera_id: str
     scores: tuple[ViewScore, ...]  # of every candidate, best first
-    plan: tuple[tuple[str, float], ...]  # the chosen view, then greedily the next: (camera ID, share covered by then)
     confidence: float
     reason: str
 
@@ -122,8 +120,7 @@ def choose_reference(
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
     Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
-    the best view of it: 1 is a view that shows everything as well as any does. The plan goes on greedily with the
-    views that cover most of what the ones before do not.
+    the best view of it: 1 is a view that shows everything as well as any does.
 
     Raises
     ------
@@ -153,15 +150,12 @@ def choose_reference(
     if wanted is not None and wanted not in {s.camera_id for s in scores}:
         raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
     chosen = next(s for s in scores if wanted in (None, s.camera_id))
-    plan = _plan({v.camera.id: cosine > 0 for v, cosine, _ in candidates}, scores, chosen.camera_id)
     how = "as asked" if wanted else "explains most of the hidden surface"
     reason = (
         f"{chosen.camera_id}: {how}: shows {chosen.covered:.0%} of it, facing it by cos {chosen.facing:.2f}, with "
         f"{chosen.detail:.0%} of the finest detail (score {chosen.score:.2f}, best {scores[0].score:.2f})"
     )
-    if len(plan) > 1:
-        reason += "; then " + ", ".join(f"{name} to {share:.0%}" for name, share in plan[1:3])
-    return ReferenceChoice(chosen.camera_id, tuple(scores), plan, chosen.score / scores[0].score, reason)
+    return ReferenceChoice(chosen.camera_id, tuple(scores), chosen.score / scores[0].score, reason)
 
 
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
@@ -179,15 +173,3 @@ def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarr
 def _has_rim(view: ViewMasks, solid: float) -> bool:
     """Whether anything known bounds the hole."""
     return bool((dilated(view.target, 1) & rim(view, solid)).any())
-
-
-def _plan(shown: dict[str, np.ndarray], scores: Sequence[ViewScore], first: str) -> tuple[tuple[str, float], ...]:
-    """The views that cover most, one after the other (greedy maximum coverage, Nemhauser 1978)."""
-    order = {s.camera_id: k for k, s in enumerate(scores)}
-    open_, name, plan = np.ones(len(shown[first]), bool), first, []
-    while True:
-        open_ &= ~shown[name]
-        plan.append((name, float(1 - open_.mean())))
-        name = max(order, key=lambda n: ((shown[n] & open_).sum(), -order[n]))
-        if not (shown[name] & open_).any() or len(plan) > MOST_EXTRA:
-            return tuple(plan)

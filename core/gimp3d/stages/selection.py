@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,15 +21,15 @@ from .growth import LEAST_WEIGHT, Growth, find_growth
 from .look import ViewBefore
 from .outline import box_window
 from .surroundings import THICKNESS, FollowedSurface, follow_surface
+from .witness import total_over
 
-R = TypeVar("R")
 MOSTLY = 0.5  # share of a Gaussian's weight that decides: the majority
+LARGE = 0.5  # longest standard deviation of a giant, as a share of the shortest edge of the boxes
 SLACK = 1.0  # how far outside the boxes surface may still be the object's, cells of the followed surface
 RIM = 2.0  # width of the ring round the object where its colours may have run, cells of the followed surface
 LEAST_OBJECT = 0.002  # share of the region's outline that an object fills in some view to stand in a box
 LEAST_CELLS = 4.0  # of the followed surface along a box; in coarser ones a Gaussian's centre decides
 NEAR = 0.5  # how far from a box what only the removal reveals is looked for, as a share of the box's longest edge
-BATCH = 32  # views whose weights are held at once
 
 
 class Fate(IntEnum):
@@ -37,7 +37,7 @@ class Fate(IntEnum):
 
     OUTSIDE = 0  # stays: does not reach the region, or cannot be drawn
     KEPT_STRADDLING = 1  # stays: reaches in, but shows elsewhere
-    KEPT_SURFACE = 2  # stays: inside, but shows elsewhere: floor, wall, a giant of the background
+    KEPT_SURFACE = 2  # stays: inside, but seen unhidden on surface that runs on from outside, or a giant
     REMOVED_INSIDE = 3  # goes: inside
     REMOVED_STRADDLING = 4  # goes: reaches in and shows on the object
     REMOVED_REVEALED = 5  # goes: near, and only the removal would show it
@@ -167,7 +167,7 @@ def choose(
     sightings = parallel_map(lambda pair: _sighting(pair[0], *pair[1]), list(zip(views, seen)))
     near = near_region(gaussians, objects)
     weights = weigh(gaussians, near, sightings)
-    selection = select(gaussians, objects, weights)
+    selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o])
     if support > 0:
         revealed = weigh_revealed(gaussians, selection, near, sightings)
         selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, support)
@@ -275,33 +275,25 @@ def weigh(
     sightings: Sequence[Sighting],
 ) -> Weights:
     """Where each Gaussian shows while the object is there: one pass per view."""
-    sums = np.zeros((4, len(gaussians)))
+    empty = np.zeros((2, len(gaussians)))
 
-    def of(view: Sighting) -> tuple[np.ndarray, np.ndarray]:
+    def of(view: Sighting) -> np.ndarray:
         rows = np.ones(len(gaussians), bool) if view.masked else near
-        weights = label_weights(gaussians, view.camera, view.shows, Shows.MASKED if view.masked else Shows.CLEAR, rows)
-        return np.flatnonzero(rows), weights[:, rows]
+        last = Shows.MASKED if view.masked else Shows.CLEAR
+        object_, clear, *masked = label_weights(gaussians, view.camera, view.shows, last, rows)
+        return np.stack([object_, clear, masked[0], object_ + clear] if masked else [object_, clear, *empty])
 
-    for rows, (object_, clear, *masked) in _in_batches(of, sightings):
-        sums[0, rows] += object_
-        sums[1, rows] += clear
-        for under in masked:
-            sums[2, rows] += under
-            sums[3, rows] += object_ + clear
-    return Weights(*sums)
+    return Weights(*total_over(sightings, of, (4, len(gaussians))))
 
 
-def _in_batches(work: Callable[[Sighting], R], views: Sequence[Sighting]) -> Iterator[R]:
-    """parallel_map, of which only some results are there at a time."""
-    for start in range(0, len(views), BATCH):
-        yield from parallel_map(work, views[start : start + BATCH])
-
-
-def select(gaussians: Gaussians, region: Region, weights: Weights) -> Selection:
+def select(
+    gaussians: Gaussians, region: Region, weights: Weights, surroundings: Sequence[FollowedSurface]
+) -> Selection:
     """Every Gaussian's fate from where it lies and where it shows.
 
-    What reaches into the region goes if it shows mostly on the object, so that no halo is left, and stays if it shows
-    mostly elsewhere, so that no black hole opens. What shows nowhere is judged by its centre.
+    Inside, it goes unless it shows mostly elsewhere and is surface that runs on from outside, or a giant of the
+    background. What else reaches in goes if it shows mostly on the object: neither a halo is left nor a black hole
+    opened.
     """
     shown = weights.object_ + weights.clear
     on_object = weights.object_ > MOSTLY * shown
@@ -310,7 +302,12 @@ def select(gaussians: Gaussians, region: Region, weights: Weights) -> Selection:
     fates = np.zeros(len(gaussians), np.uint8)
     astride = _reaches(gaussians, region) & usable & ~centre
     fates[astride] = np.where((visible & on_object)[astride], Fate.REMOVED_STRADDLING, Fate.KEPT_STRADDLING)
-    fates[centre] = np.where((visible & ~on_object)[centre], Fate.KEPT_SURFACE, Fate.REMOVED_INSIDE)
+    fates[centre] = Fate.REMOVED_INSIDE
+    elsewhere = np.flatnonzero(centre & visible & ~on_object)
+    stays = gaussians.scales[elsewhere].max(1) > LARGE * min(box.size.min() for box in region)
+    for part in surroundings:
+        stays |= np.isfinite(part.distance(gaussians.means[elsewhere].astype(np.float64)))
+    fates[elsewhere[stays]] = Fate.KEPT_SURFACE
     under_masks = weights.masked > np.maximum(LEAST_WEIGHT, MOSTLY * (weights.masked + weights.unmasked))
     fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
@@ -328,14 +325,12 @@ def weigh_revealed(
     """
     stays = ~selection.removed
     kept, wanted = gaussians.take(stays), near[stays]
-    total = np.zeros(len(gaussians))
-    rows = np.flatnonzero(stays)[wanted]
 
     def of(view: Sighting) -> np.ndarray:
-        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0, wanted]
+        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0]
 
-    for part in _in_batches(of, sightings):
-        total[rows] += part
+    total = np.zeros(len(gaussians))
+    total[stays] = np.where(wanted, total_over(sightings, of, (len(kept),)), 0)
     return total
 
 

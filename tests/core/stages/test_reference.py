@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scenes import REGION, cameras, scene
@@ -34,21 +32,6 @@ def test_the_steep_view_wins_over_the_grazing_one_and_the_cut_off_one() -> None:
     assert scores["cut off"].covered < 0.8 * scores["steep"].covered
     assert scores["grazing"].facing < 0.5 * scores["steep"].facing
     assert all(0 < s.score <= 1 and 0 < s.detail <= 1 for s in choice.scores)
-
-
-def test_what_one_view_does_not_show_is_planned_for_the_next() -> None:
-    masks = find_masks(scene(), REGION, cameras())
-    left, right = (np.arange(120) < 60)[None], (np.arange(120) >= 60)[None]
-    first = masks.views[0]
-    views = [
-        replace(first, camera=replace(first.camera, id=name), target=first.target & part)
-        for name, part in (("left", left), ("right", right))
-    ]
-    choice = choose_reference([*views, replace(first, camera=replace(first.camera, id="none"), target=left & right)])
-    assert {name for name, _ in choice.plan} == {"left", "right"}
-    shares = [share for _, share in choice.plan]
-    assert 0.2 < shares[0] < 0.8 and shares[1] == 1.0
-    assert choice.plan[1][0] in choice.reason
 
 
 def test_the_needed_surface_is_the_floor_under_the_object() -> None:
