@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
 	bench-ablation bench-propagate bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
-	bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
+	bench-large bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -77,10 +77,6 @@ bench-ablation: $(READY)
 bench-propagate: $(READY)
 	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate \
 		--rules "the warp" "paper's sampling" "paper's blend"
-
-# 128 removals: an hour, so not part of bench
-bench-references: $(READY)
-	$(BIN)/python -m benchmarks.references $(DATA)
 
 # every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
 bench-real: $(READY)
