@@ -11,7 +11,7 @@ import numpy as np
 from . import pictures
 from .errors import IllPosed
 from .gaussians import Gaussians
-from .geometry import SAME_DEPTH, SOLID
+from .geometry import SAME_DEPTH
 from .run import Run, counted
 from .stages.charts import Chart
 from .stages.propagate import Reference
@@ -104,7 +104,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     """One view without the object; the program chooses it unless the user named one."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
     masks = [v.left for v in views]
-    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, SOLID, settings.reference, tried)
+    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, settings.reference, tried)
     run.references.append(choice)
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix

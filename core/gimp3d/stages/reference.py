@@ -50,9 +50,9 @@ class ReferenceChoice:
     reason: str
 
 
-def rim(view: ViewMasks, solid: float = SOLID) -> np.ndarray:
+def rim(view: ViewMasks) -> np.ndarray:
     """[H, W] bool: pixels whose depth after the removal is trusted."""
-    return ~view.target & (view.alpha_after > solid) & (view.depth_after > 0)
+    return ~view.target & (view.alpha_after > SOLID) & (view.depth_after > 0)
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,11 @@ class NeededSurface:
     normals: np.ndarray  # [S, 3] unit, world, facing the view they come from
 
 
-def needed_surface(
-    views: Sequence[ViewMasks], solid: float = SOLID, settings: ReferenceSettings = ReferenceSettings()
-) -> NeededSurface:
+def needed_surface(views: Sequence[ViewMasks], settings: ReferenceSettings = ReferenceSettings()) -> NeededSurface:
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
     seeing = [v for v in views if v.target.any()]
     step = max(1, -(-len(seeing) // SURFACE_VIEWS))
-    parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step], most=2)  # mostly Python's work
+    parts = parallel_map(lambda v: _surface_in(v, settings), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
         return NeededSurface(points, normals)
@@ -79,12 +77,12 @@ def needed_surface(
     return NeededSurface(points[np.sort(first)], normals[np.sort(first)])
 
 
-def _surface_in(view: ViewMasks, solid: float, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
+def _surface_in(view: ViewMasks, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
     """Points and normals [M, 3] in the world and their spacing [M, 1], from one view's hole; none if it has no rim."""
     camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / settings.samples))))
     target, depth = view.target[part], view.depth_after[part]
     try:
-        completed = complete_disparity(disparity_of(depth), rim(view, solid)[part], target, settings=PROVISIONAL)
+        completed = complete_disparity(disparity_of(depth), rim(view)[part], target, settings=PROVISIONAL)
     except IllPosed:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
     depth = np.where(target, completed.depth, depth)
@@ -113,7 +111,6 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
-    solid: float = SOLID,
     settings: ReferenceSettings = ReferenceSettings(),
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
@@ -127,14 +124,14 @@ def choose_reference(
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    surface = needed_surface(views, solid, settings)
+    surface = needed_surface(views, settings)
 
     def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
         return _seen(view, surface) if view.target.any() else None
 
     seen = parallel_map(shown_in, views, most=2)
     untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
-    candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and _has_rim(v, solid)]
+    candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and (dilated(v.target, 1) & rim(v)).any()]
     if not candidates:
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
     best_worth = np.max([cosine * density for _, cosine, density in candidates], axis=0)
@@ -168,8 +165,3 @@ def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarr
     found = np.zeros((2, len(cosine)))
     found[:, index] = cosine[index], cosine[index] * camera.fx * camera.fy / z**2
     return found[0], found[1]
-
-
-def _has_rim(view: ViewMasks, solid: float) -> bool:
-    """Whether anything known bounds the hole."""
-    return bool((dilated(view.target, 1) & rim(view, solid)).any())

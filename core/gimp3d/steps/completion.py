@@ -12,7 +12,7 @@ import scipy.ndimage
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..geometry import SOLID, disparity_of, sees
+from ..geometry import disparity_of, sees
 from ..presets import RemovalSettings
 from ..priors.appearance import Appearance
 from ..priors.calls import Call
@@ -178,7 +178,7 @@ def complete_view_depth(
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     depth_settings = replace(settings.depth, surface=surface)
     others = [v.left for v in views]
-    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks, SOLID), prior, depth_settings)
+    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks), prior, depth_settings)
 
 
 def paint_view(
