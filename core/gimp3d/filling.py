@@ -104,7 +104,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     """One view without the object; the program chooses it unless the user named one."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
     masks = [v.left for v in views]
-    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, settings.reference, tried)
+    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
     run.references.append(choice)
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix

@@ -9,11 +9,9 @@ from .schema import Seed, Share
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
-from .stages.evidence import EvidenceSettings
 from .stages.mapping import MappingSettings
 from .stages.masks import MaskSettings
 from .stages.propagate import PropagateSettings
-from .stages.reference import ReferenceSettings
 from .stages.refine import RefineSettings
 from .stages.seed import SeedSettings
 from .stages.selection import SelectionSettings
@@ -26,8 +24,6 @@ class RemovalSettings:
     masks: MaskSettings = MaskSettings()
     charts: ChartSettings | None = ChartSettings()  # None: photos are the only references (paper)
     clearing: ClearingSettings = ClearingSettings()
-    reference: ReferenceSettings = ReferenceSettings()
-    evidence: EvidenceSettings = EvidenceSettings()
     depth: DepthSettings = DepthSettings()
     mapping: MappingSettings = MappingSettings()
     propagate: PropagateSettings = PropagateSettings()

@@ -361,7 +361,7 @@ BAD = {  # the command, its exit code, and what its error says
     "negative margin": (f"{REMOVE} --set masks.margin=-1", 2, "masks.margin: must be from 0 to 1000, got -1"),
     "NaN for a setting": (f"{REMOVE} --set masks.selection.support=nan", 2, "a finite number"),
     "a huge setting": (f"{REMOVE} --set masks.margin=1000000000", 2, "from 0 to 1000"),
-    "no samples": (f"{REMOVE} --set reference.samples=0", 2, "from 1 to"),
+    "no samples": (f"{REMOVE} --set depth.unknowns=0", 2, "from 1 to"),
     "an unknown word for a setting": (f"{REMOVE} --set masks.mode=some", 2, "need or paper expected"),
     "a file for a job": ("remove --job roi.json", 2, "job.json"),
     "a file for a new job": (f"{REMOVE} --job roi.json", 2, "cannot make the folder"),

@@ -12,21 +12,14 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
-from ..schema import Many
 from ..solvers.planes import RING
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks
 
+SAMPLES = 2000  # of the hidden surface from each view, about
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
 # Where the hidden surface is, about: coarse and fast.
 PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)
-
-
-@dataclass(frozen=True)
-class ReferenceSettings:
-    """How the choice of a reference is made."""
-
-    samples: Many = 2000  # points; of the hidden surface from each view, about: a steadier choice for more time
 
 
 @dataclass(frozen=True)
@@ -63,11 +56,14 @@ class NeededSurface:
     normals: np.ndarray  # [S, 3] unit, world, facing the view they come from
 
 
-def needed_surface(views: Sequence[ViewMasks], settings: ReferenceSettings = ReferenceSettings()) -> NeededSurface:
+def needed_surface(
+    views: Sequence[ViewMasks],
+    samples: int = SAMPLES,  # from each view
+) -> NeededSurface:
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
     seeing = [v for v in views if v.target.any()]
     step = max(1, -(-len(seeing) // SURFACE_VIEWS))
-    parts = parallel_map(lambda v: _surface_in(v, settings), seeing[::step], most=2)  # mostly Python's work
+    parts = parallel_map(lambda v: _surface_in(v, samples), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
         return NeededSurface(points, normals)
@@ -77,9 +73,9 @@ def needed_surface(views: Sequence[ViewMasks], settings: ReferenceSettings = Ref
     return NeededSurface(points[np.sort(first)], normals[np.sort(first)])
 
 
-def _surface_in(view: ViewMasks, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
+def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
     """Points and normals [M, 3] in the world and their spacing [M, 1], from one view's hole; none if it has no rim."""
-    camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / settings.samples))))
+    camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / samples))))
     target, depth = view.target[part], view.depth_after[part]
     try:
         completed = complete_disparity(disparity_of(depth), rim(view)[part], target, settings=PROVISIONAL)
@@ -111,7 +107,6 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
-    settings: ReferenceSettings = ReferenceSettings(),
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
@@ -124,7 +119,7 @@ def choose_reference(
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    surface = needed_surface(views, settings)
+    surface = needed_surface(views)
 
     def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
         return _seen(view, surface) if view.target.any() else None

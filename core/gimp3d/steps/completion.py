@@ -197,7 +197,7 @@ def paint_view(
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
         sources = ((v.camera, v.bare, np.where(v.left.silhouette, 0, v.left.depth_before)) for v in views)
-        evidence = gather_evidence(masks.camera, depth, masks.target, sources, settings.evidence)
+        evidence = gather_evidence(masks.camera, depth, masks.target, sources)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
     filled = inpaint_reference(

@@ -10,7 +10,7 @@ from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
 from gimp3d.orbit import look_at
 from gimp3d.stages.masks import find_masks
-from gimp3d.stages.reference import ReferenceSettings, _coarse, choose_reference, needed_surface
+from gimp3d.stages.reference import _coarse, choose_reference, needed_surface
 
 UP = np.array([0, 0, 1.0])
 
@@ -54,7 +54,7 @@ def test_a_coarse_view_shows_the_same_points(step: int) -> None:
 
 def test_large_holes_are_sampled_as_well_as_small_ones() -> None:
     views = find_masks(scene(), REGION, cameras()).views
-    fine, coarse = (needed_surface(views, settings=ReferenceSettings(samples=n)) for n in (10**6, 50))
+    fine, coarse = (needed_surface(views, samples=n) for n in (10**6, 50))
     assert 0 < len(coarse.points) < 0.5 * len(fine.points)
     apart = np.linalg.norm(fine.points[:, None] - coarse.points[None], axis=-1)
     assert apart.min(1).max() < 0.15 and apart.min(0).max() < 0.1  # one surface, and all of it
