@@ -67,6 +67,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
+    "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
     "whole patches vote in the end": (("gimp3d.solvers.exemplar:OWN", 99),),
     "only patches' middle pixels vote": (("gimp3d.solvers.exemplar:OWN", 0),),
     "Telea's fill": (("inpaint", "telea"),),

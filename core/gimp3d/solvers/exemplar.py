@@ -13,6 +13,7 @@ import numpy as np
 
 from ..compute.jit import kernel
 from ..compute.threads import run_ranges
+from .edges import find_edges, guide_of
 from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
@@ -30,12 +31,13 @@ from .regularity import continue_regularly, find_motions
 from .surface import TangentPlanes, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
+OWN = 2  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
 SELECTIVE = 4.0  # a patch that only a quarter fits worse than votes by e^-4: higher is sharper, and noisier
 LEAST_SAY = 1e-12  # of a patch that fits badly
+EDGE = 0.15  # difference in colour that counts as much as being on an edge, or beside it, or not
 FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
 
@@ -72,6 +74,8 @@ def complete_picture(
 ) -> Completion:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
 
+    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges.
+
     What is unknown near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
 
     With a surface patches are compared and copied along its tangent planes, and what lies on another surface
@@ -97,6 +101,8 @@ def complete_picture(
     unknown = unknown & ~hole
     if surface is not None:  # what is filled is mixed with nothing
         surface = surface._replace(clear=surface.clear | hole)
+    # where photos disagree a little, what they show tells edges all the same
+    edges = () if surface is not None else find_edges(given, asked, ~asked & given.any(-1))
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
@@ -111,7 +117,8 @@ def complete_picture(
         finest = number == len(levels) - 1
         # … but the average is what makes up for their resampling where they are warped along a surface.
         reach = min(radius, OWN) if finest and surface is None else radius
-        level = _prepared(channels, open_, barred, there, radius, reach, settings)
+        guide = guide_of(edges, open_.shape, 2 ** (len(levels) - 1 - number), max(radius, 1))
+        level = _prepared(channels, open_, barred, np.float32(EDGE) * guide, there, radius, reach, settings)
         colours, field = _filled(level, field, rounds, settings)
     assert field is not None
     sources = image[field.rows[hole], field.cols[hole]]
@@ -128,6 +135,7 @@ class _Level:
 
     channels: np.ndarray  # [h, w, 5] float32: colours and texture features
     hole: np.ndarray  # [h, w] bool
+    edges: np.ndarray  # [h, w, 2] float32, see guide_of: known in the hole as well
     touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
@@ -141,6 +149,7 @@ def _prepared(
     channels: np.ndarray,
     hole: np.ndarray,
     unknown: np.ndarray,
+    edges: np.ndarray,
     surface: TangentPlanes | None,
     radius: int,
     reach: int,
@@ -158,7 +167,7 @@ def _prepared(
         allowed = whole
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
     trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, touching, usable, allowed, trust, surface, radius, reach)
+    return _Level(channels, hole, edges, touching, usable, allowed, trust, surface, radius, reach)
 
 
 def _filled(
@@ -174,7 +183,9 @@ def _filled(
     guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
     matching, reach = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps), REACH
     if coarser is None:
-        rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.surface, level.usable)
+        rows, cols = fill_inwards(
+            level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE, level.surface, level.usable
+        )
         colours = level.channels[rows[hole], cols[hole]]
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
         if level.surface is None:
@@ -194,8 +205,8 @@ def _filled(
         guides[hole] = colours[:, 3:]
         matching = replace(matching, seed=settings.seed + 31 * number)
         field = refined(
-            field, patches, level.touching, allowed, matching, penalty, index, guides, level.surface, level.usable,
-            reach, tree_sweeps=1,
+            field, patches, level.touching, allowed, matching, penalty, index, np.dstack([guides, level.edges]),
+            level.surface, level.usable, reach, tree_sweeps=1,
         )  # fmt: skip
         voted = _voted(level, field, _say(level, field), colours)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())

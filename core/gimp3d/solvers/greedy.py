@@ -14,6 +14,7 @@ from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, Tangen
 MOST_SOURCES = 4096  # patches that are tried for each place
 NO_SUPPORT = np.empty((0, 0), np.uint8)
 LEAST_SHARE = 1e-6  # what was copied without anything known around
+FIRST = float32(10)  # times as urgent as others are places on lines
 PLAIN = 0.03  # slope of colour per pixel, where no edge runs into the hole, by which a place counts nevertheless
 
 
@@ -22,6 +23,7 @@ def fill_inwards(
     hole: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
     radius: int,
+    first: np.ndarray,  # [H, W] float32 in [0, 1]: how near a place is to a line that is filled before the rest
     surface: TangentPlanes | None = None,  # copy along its tangent planes
     usable: np.ndarray | None = None,  # [H, W] bool, what may be copied then
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +46,7 @@ def fill_inwards(
         number[hole] = np.arange(len(places))
         support = supports(surface, places, radius)
     _fill_inwards(
-        *patches, places, rows[thinned], cols[thinned], ~hole if usable is None else usable, known, share,
+        *patches, first, places, rows[thinned], cols[thinned], ~hole if usable is None else usable, known, share,
         surface is not None, *(surface or NO_SURFACE), support, number, found_rows, found_cols,
     )  # fmt: skip
     return found_rows, found_cols
@@ -82,7 +84,7 @@ def _edge_into_hole(values, stride, channels, radius, known, y, x):
 
 @kernel
 def _fill_inwards(
-    values, stride, channels, radius, row_weights, places, source_rows, source_cols, usable, known, share,
+    values, stride, channels, radius, row_weights, first, places, source_rows, source_cols, usable, known, share,
     slanted, point, normal, frame, inverse, plane, clear, support, number, rows, cols,
 ):  # fmt: skip
     """`known` and `share` are [H + 2 radius, W + 2 radius]: a pixel's confidence and its mean over the patch."""
@@ -105,6 +107,7 @@ def _fill_inwards(
             if beside and edges[a, b] < 0:
                 edges[a, b] = _edge_into_hole(values, stride, channels, radius, known, a, b)
             priority = share[a + radius, b + radius] * (PLAIN + max(edges[a, b], float32(0)))
+            priority *= float32(1) + FIRST * first[a, b]
             if not beside:
                 priority *= float32(1e-6)  # its turn comes only where the hole has no rim
             if priority > best:

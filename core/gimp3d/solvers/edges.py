@@ -1,0 +1,257 @@
+"""Straight edges that a hole cuts: each is told on both sides of it, and runs straight on in between.
+
+What is large is continued before what is small (structure propagation: Sun, Yuan, Jia and Shum 2005).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ..compute.threads import parallel_map
+
+SIDE = 192  # px: pictures are shrunk to this to look for edges
+ANGLE = 2.0  # degrees between directions that are tried
+REACH, LEAST = 40, 12  # known px on either side of the hole that tell an edge: at most, at least
+FURTHEST = 3  # times REACH, from the hole, where they lie at most
+TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
+STEEP = 4.0  # grey levels that it must be
+CLUMPED = 4.0  # by which textures' noise exceeds that of independent pixels, squared
+LIKE = 0.7  # cosine between the steps on both sides
+ROWS = np.array([-6, -5, -4, -2, -1, 1, 2, 4, 5, 6])  # px across an edge
+FAR_ABOVE, ABOVE, BELOW, FAR_BELOW = slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)
+SHARP = 0.5  # share of the step between what is further from it that it must be: else it is a slope
+BLOCKS, STEADY = 5, 0.5  # of what tells it on either side, in each of which it is this share of the usual step
+BLOCK = 8  # px, in each of which it is that further off, as far as it goes
+APART = 6  # px between edges where they run into the hole
+LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
+MOST = 8  # edges of a part of the hole
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A straight line through a hole."""
+
+    origin: np.ndarray  # [2] (x, y) px, where the hole's middle is nearest
+    along: np.ndarray  # [2] unit
+    ends: tuple[float, float]  # px along it, between which it is seen or runs through the hole
+    told: float  # times the noise that the step is
+
+
+def find_edges(
+    image: np.ndarray,  # [H, W, 3] uint8
+    hole: np.ndarray,  # [H, W] bool
+    known: np.ndarray,  # [H, W] bool, what the picture shows well
+) -> tuple[Edge, ...]:
+    """The edges that run into each part of the hole on one side and go on, with the same colours, on the other."""
+    count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
+    picture = image.astype(np.float32)
+    found: list[Edge] = []
+    for part in range(1, count):
+        if parts[part, cv2.CC_STAT_AREA] >= LEAST_HOLE:
+            found += _of_part(picture, labels == part, known)
+    return tuple(found)
+
+
+def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
+    rows, cols = np.nonzero(hole)
+    far = FURTHEST * REACH
+    near = np.s_[max(0, rows.min() - far) : rows.max() + far + 1, max(0, cols.min() - far) : cols.max() + far + 1]
+    corner = np.array([near[1].start, near[0].start])
+    picture, hole, known = picture[near], hole[near], known[near]
+    scale = min(1.0, SIDE / max(hole.shape))
+    size = tuple(max(1, round(n * scale)) for n in hole.shape[::-1])
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    there = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    open_ = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+    angles = np.arange(0, 180, ANGLE)
+    told = np.array(parallel_map(lambda a: _steps(small, there, open_, a, scale), angles))  # [angles, rows]
+    middle = (np.array(size) - 1) / 2
+    places = np.argwhere(open_)[:, ::-1] - middle
+    found: list[Edge] = []
+    for _ in range(MOST):
+        k, row = np.unravel_index(int(told.argmax()), told.shape)
+        if told[k, row] <= 0:
+            break
+        along, across = _axes(angles[k])
+        offset = row - (told.shape[1] - 1) / 2
+        cut = (places @ along)[np.abs(places @ across - offset) <= 1]
+        ends = offset * across + np.outer((cut.min(), cut.max()), along)
+        for other, angle in enumerate(angles):
+            off = ends @ _axes(angle)[1] + (told.shape[1] - 1) / 2
+            beside = np.abs(np.arange(told.shape[1])[:, None] - off) <= max(1.5, APART * scale)
+            told[other, beside.any(1)] = 0
+        if cut.max() - cut.min() >= LEAST_CUT * scale:
+            place = ((offset * across + middle) + 0.5) / scale - 0.5
+            edge = _settled(picture, known, hole, angles[k], place)
+            if edge is not None:
+                found.append(replace(edge, origin=edge.origin + corner))
+    return found
+
+
+def _axes(angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """(x, y) along a line and across it."""
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    return np.array([c, s]), np.array([-s, c])
+
+
+def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, scale: float) -> np.ndarray:
+    """[rows] of the picture turned by the angle: by how many times its noise colours change there, on both sides."""
+    h, w = hole.shape
+    along, across = _axes(angle)
+    side = math.ceil(math.hypot(h, w)) | 1
+    middle = np.array([w - 1, h - 1]) / 2 - (side - 1) / 2 * (along + across)
+    matrix = np.column_stack([along, across, middle])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned = cv2.warpAffine(picture, matrix, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    shown = cv2.warpAffine(known.astype(np.float32), matrix, (side, side), flags=flags) > 0.999
+    open_ = cv2.warpAffine(hole.astype(np.float32), matrix, (side, side), flags=flags) > 0.5
+    rows = np.flatnonzero(open_.any(1))
+    if not len(rows):
+        return np.zeros(side)
+    open_, shown, turned = open_[rows], shown[rows], turned[rows].astype(np.float64)
+    weight = shown[..., None].astype(np.float64)
+    sums = np.concatenate([weight, turned * weight, turned**2 * weight], axis=-1).cumsum(1)
+    sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], axis=1)  # [rows, side + 1, 7]
+    number = np.arange(len(rows))
+    begins, ends = open_.argmax(1), side - open_[:, ::-1].argmax(1)
+    reach, far = REACH * scale, round(FURTHEST * REACH * scale)
+    counts = sums[..., 0]
+    first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
+    last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
+    sides = []
+    for lo, hi in ((np.maximum(first, begins - far), begins), (ends, np.minimum(last, ends + far))):
+        whole = np.zeros((side, 7))
+        whole[rows] = sums[number, hi] - sums[number, lo]
+        sides.append(whole)
+    return _told([(_above(s), _below(s)) for s in sides], 2 * LEAST * scale)
+
+
+def _above(rows: np.ndarray) -> np.ndarray:
+    return np.roll(rows, 1, 0) + np.roll(rows, 2, 0)
+
+
+def _below(rows: np.ndarray) -> np.ndarray:
+    return np.roll(rows, -1, 0) + np.roll(rows, -2, 0)
+
+
+def _told(sides: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> np.ndarray:
+    """[N]: steps between two rows above and two below, of sums [N, 7]: pixels, colours, their squares; 0 for none."""
+    steps, told, enough = [], np.full(len(sides[0][0]), np.inf), np.full(len(sides[0][0]), True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for pair in sides:
+            means, noise = [], np.zeros(len(told))
+            for sums in pair:
+                pixels = sums[:, :1]
+                means.append(sums[:, 1:4] / pixels)
+                spread = np.maximum((sums[:, 4:] / pixels - means[-1] ** 2).sum(1), 1.0)
+                noise = noise + CLUMPED * spread / pixels[:, 0]
+                enough = enough & (pixels[:, 0] >= least)
+            steps.append(means[1] - means[0])
+            size = np.linalg.norm(steps[-1], axis=1)
+            told = np.minimum(told, np.where(size >= STEEP, size / np.sqrt(noise), 0))
+        alike = (steps[0] * steps[1]).sum(1) > LIKE * np.prod([np.linalg.norm(s, axis=1) for s in steps], axis=0)
+    return np.where(enough & alike & (told >= TELLS), told, 0.0)
+
+
+def _settled(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray) -> Edge | None:
+    """The edge at full resolution: turned and shifted to where it is told best (pattern search: Hooke 1961)."""
+    rows, cols = np.nonzero(hole)
+    pixels = np.stack([cols, rows], 1).astype(np.float64)
+    shows = known.astype(np.float32)
+    heart = place + ((pixels - place) @ _axes(angle)[0]).mean() * _axes(angle)[0]
+
+    def at(values: np.ndarray) -> tuple[float, Edge | None]:
+        along, across = _axes(angle + values[0])
+        origin = heart + values[1] * across
+        cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
+        if not len(cut):
+            return 0.0, None
+        sides, ends, steady = [], [], True
+        for start, step in ((cut.min() - 1, -1), (cut.max() + 1, 1)):
+            t = start + step * np.arange(FURTHEST * REACH)
+            grid = origin + t[None, :, None] * along + ROWS[:, None, None] * across
+            x, y = np.ascontiguousarray(grid.transpose(2, 0, 1), np.float32)
+            there = cv2.remap(shows, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[..., None] > 0.999
+            colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            sums = np.concatenate([np.ones_like(colours[..., :1]), colours, colours**2], -1) * there
+            near = sums * (there.cumsum(1) <= REACH)
+            sides.append(tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW)))
+            steady = steady and _is_edge(near)
+            ends.append(float(t[_length(sums, _step(near))]))
+        told = float(_told(sides, 2 * LEAST)[0])
+        return told, Edge(origin, along, (ends[0], ends[1]), told) if steady else None
+
+    values, step = np.zeros(2), 1.0
+    best = at(values)
+    while step > 0.1:
+        tried = [(at(m), m) for m in (values + step * s * np.eye(2)[k] for k in range(2) for s in (1, -1))]
+        (score, edge), move = max(tried, key=lambda t: t[0][0])
+        if score > best[0]:
+            best, values = (score, edge), move
+        else:
+            step /= 2
+    return best[1] if best[0] > 0 else None
+
+
+def _mean(sums: np.ndarray) -> np.ndarray:
+    total = sums[..., :4].sum((0, 1))
+    return total[1:] / max(total[0], 1)
+
+
+def _step(sums: np.ndarray, above: slice = ABOVE, below: slice = BELOW) -> np.ndarray:
+    """[3]: by how much mean colours change across a line; sums [ROWS, N, 7] beside it."""
+    return _mean(sums[below]) - _mean(sums[above])
+
+
+def _is_edge(sums: np.ndarray) -> bool:
+    """Whether colours step all along a line, and at once."""
+    pixels = sums[..., 0].sum(0).cumsum()
+    block = np.minimum((BLOCKS * pixels / max(pixels[-1], 1)).astype(int), BLOCKS - 1)
+    whole = _step(sums)
+    size = max(float(np.linalg.norm(whole)), 1e-9)
+    each = np.array([_step(sums[:, block == k]) for k in range(BLOCKS)]) @ whole / size
+    sharp = size**2 >= SHARP * (_step(sums, FAR_ABOVE, FAR_BELOW) @ whole)
+    return bool(sharp and each.min() >= STEADY * np.median(each))
+
+
+def _length(sums: np.ndarray, whole: np.ndarray) -> int:
+    """How many px along a line colours step like that; where they are unknown, they may."""
+    last = 0
+    for end in range(BLOCK, sums.shape[1] + 1, BLOCK):
+        block = sums[:, end - BLOCK : end]
+        if block[ABOVE, :, 0].any() and block[BELOW, :, 0].any():
+            if _step(block) @ whole < STEADY * (whole @ whole):
+                break
+            last = end - 1
+    return last
+
+
+def guide_of(
+    edges: Sequence[Edge],
+    shape: tuple[int, int],
+    shrunk: float,  # times, the picture that the edges were found in
+    width: float,  # px, σ
+) -> np.ndarray:
+    """[h, w, 2] float32 in [-1, 1]: how near to an edge a pixel lies, and on which side of it.
+
+    Two pixels of the same guide lie at the same distance from an edge; it is 0 far from one and beyond its ends.
+    """
+    h, w = shape
+    x, y = (np.arange(n, dtype=np.float32) for n in (w, h))
+    guide, nearest = np.zeros((h, w, 2), np.float32), np.full((h, w), np.inf, np.float32)
+    for edge in edges:
+        origin = (edge.origin + 0.5) / shrunk - 0.5
+        dx, dy = x[None] - np.float32(origin[0]), y[:, None] - np.float32(origin[1])
+        along = dx * np.float32(edge.along[0]) + dy * np.float32(edge.along[1])
+        off = (dy * np.float32(edge.along[0]) - dx * np.float32(edge.along[1])) / np.float32(width)
+        there = (along >= edge.ends[0] / shrunk) & (along <= edge.ends[1] / shrunk)
+        closer = there & (np.abs(off) < nearest)
+        fades = np.exp(-0.5 * off**2)
+        guide[closer] = np.stack([fades, off * fades * np.float32(math.exp(0.5))], -1)[closer]
+        nearest[closer] = np.abs(off)[closer]
+    return guide

@@ -1,0 +1,92 @@
+"""Straight edges are told on both sides of a hole, and what is no straight edge is not."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from gimp3d.solvers.edges import find_edges, guide_of
+from gimp3d.solvers.exemplar import complete_picture
+
+SIDE, MIDDLE = 180, 90
+HOLE = np.hypot(*np.indices((SIDE, SIDE)) - MIDDLE) < 30
+Y, X = np.indices((SIDE, SIDE)) - MIDDLE
+
+
+def textured(picture: np.ndarray, grain: float, size: float = 1.5, seed: int = 0) -> np.ndarray:
+    """[H, W] → [H, W, 3] uint8 with blobs of a few pixels over it."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(0, 1, picture.shape), (0, 0), size)
+    return np.clip(picture + grain * noise / noise.std(), 1, 255).astype(np.uint8)[..., None].repeat(3, 2)
+
+
+def found(picture: np.ndarray, hole: np.ndarray = HOLE):  # type: ignore[no-untyped-def]
+    return find_edges(np.where(hole[..., None], np.uint8(0), picture), hole, ~hole)
+
+
+def side_of(angle: float, offset: float) -> np.ndarray:
+    a = math.radians(angle)
+    return math.cos(a) * Y - math.sin(a) * X - offset
+
+
+@pytest.mark.parametrize("angle", [0, 17, 48, 90, 133])
+@pytest.mark.parametrize("offset", [-15, 0, 9])
+def test_a_border_of_two_textures_is_found_where_it_is(angle: float, offset: float) -> None:
+    edges = found(textured(np.where(side_of(angle, offset) > 0, 150.0, 100.0), 12))
+    assert len(edges) == 1
+    along, ends = edges[0].along, edges[0].ends
+    off = [side_of(angle, offset)[tuple(np.rint(edges[0].origin + t * along).astype(int)[::-1])] for t in (-25, 25)]
+    assert np.abs(off).max() < 1.5
+    assert ends[1] - ends[0] > 100
+
+
+@pytest.mark.parametrize(("half_width", "edges"), [(1, 1), (8, 2)])
+def test_a_line_is_an_edge_and_a_stripe_two(half_width: float, edges: int) -> None:
+    assert len(found(textured(np.where(np.abs(side_of(62, 4)) < half_width, 90.0, 170.0), 5))) == edges
+
+
+def test_what_hides_some_of_an_edge_is_looked_past() -> None:
+    picture, beside = textured(np.where(side_of(30, 0) > 0, 150.0, 100.0), 12), np.hypot(X - 40, Y - 23) < 18
+    picture[beside] = 0
+    assert len(find_edges(picture, HOLE, ~HOLE & ~beside)) == 1
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        *(textured(np.full((SIDE, SIDE), 128.0), 30, size, seed) for size in (1, 3, 8) for seed in range(3)),
+        textured(128 + 0.6 * side_of(20, 0), 3),  # a slope
+        textured(128 + 40 * np.sin((side_of(0, 0) + 6 * np.sin(X / 13)) / 9), 3),  # waves
+        textured(np.where(side_of(0, 0) * (X > 0) > 0, 150.0, 100.0), 8),  # an edge on one side only
+        textured(np.where(side_of(0, np.where(X > 0, 20, -20)) > 0, 150.0, 100.0), 8),  # two that miss each other
+        textured(np.where((side_of(0, 0) > 0) ^ (X > 0), 150.0, 100.0), 8),  # opposite steps
+    ],
+)  # fmt: skip
+def test_nothing_else_is_a_straight_edge(picture: np.ndarray) -> None:
+    assert all(abs(np.degrees(math.atan2(e.along[1], e.along[0]))) > 60 for e in found(picture))  # the upright X = 0 is
+
+
+def test_pixels_of_one_guide_lie_at_one_distance() -> None:
+    edge = found(textured(np.where(side_of(48, 3) > 0, 150.0, 100.0), 6))[0]
+    guide = guide_of((edge,), HOLE.shape, 1, 6)
+    off = (Y + MIDDLE - edge.origin[1]) * edge.along[0] - (X + MIDDLE - edge.origin[0]) * edge.along[1]
+    near = (np.abs(off) < 6) & (np.hypot(X, Y) < 60)
+    assert np.ptp(guide[near & (np.abs(off - 2) < 0.05)], axis=0).max() < 0.05
+    assert ((guide[near, 1] > 0) == (off[near] > 0)).all()
+    assert np.abs(guide[np.abs(off) > 30]).max() < 1e-3
+    half = guide_of((edge,), (SIDE // 2, SIDE // 2), 2, 3)
+    shrunk = cv2.resize(guide, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    assert np.abs(half - shrunk)[np.hypot(X, Y)[::2, ::2] < 60].max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_straight_border_stays_straight_through_a_large_hole(seed: int) -> None:
+    """Patches alone bend it, or let one side grow over the other: both textures fit the hole's rim."""
+    truth = textured(np.where(side_of(62, 4) > 0, 150.0, 110.0), 14, 2.0, seed)
+    truth[..., 0] = np.where(side_of(62, 4) > 0, truth[..., 0], truth[..., 0] // 2)
+    hole = (np.abs(side_of(62, 0)) < 35) & (np.abs(side_of(152, 0)) < 60)
+    filled = complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole).image.astype(int)
+    wrong = hole & ((filled[..., 1] - filled[..., 0] < 20) != (side_of(62, 4) > 0)) & (np.abs(side_of(62, 4)) > 2)
+    assert wrong.sum() < 0.005 * hole.sum()
