@@ -128,7 +128,7 @@ def _painted(
     elif settings.transfer == "learned":
         alike = photo & flat(depth)
         alike[alike] = warp.lookup(reference.source, alike)
-        change = learned_change(warp.colours, base - warp.colours, alike, reach)
+        change = learned_change(warp.colours, base - warp.colours, alike, hole, reach)
         raw = warp.colours + change.of(warp.colours).astype(np.float32)
     if settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
