@@ -53,17 +53,23 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "targets as the paper's": (("masks.mode", "paper"), ("charts", None)),
     "what has its centre in the box is the object": (("masks.selection.by_centre", True),),
     "a membrane behind the object": (("depth.surface", "harmonic"),),
+    "smears that only the removal reveals stay": (("masks.selection.support", 0.0),),
+    "views' agreement asks no more of photos": (("gimp3d.stages.masks:USUAL_AGREEMENT", 0.0),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
+    "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
+    "depth seams do not stop the blend": (("gimp3d.stages.propagate.blend:SEAM", 1e9),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),
     "colours as seeded": (("seed.corrections", 0),),
     "no view dependence": (("seed.sh_degree", 0),),
     "degree 1": (("seed.sh_degree", 1),),
     "degree 3": (("seed.sh_degree", 3),),
+    "Gaussians that show nowhere stay": (("gimp3d.stages.seed:NEEDED", -1.0),),
     "not refined": (("refine.steps", 0),),
+    "refined by L1 alone": (("gimp3d.stages.refine:SSIM", 0.0),),
     "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
