@@ -121,6 +121,7 @@ def _remove_command(command: Command) -> None:
     option("--resume", action="store_true", help="go on from the finished stages in --job")
     option("--device", choices=("auto", "cpu", "cuda"), default="auto")
     option("--seed", type=int, default=0)
+    option("--variants", type=int, default=1, metavar="N", help="N fills to choose from: OUT.ply, OUT.2.ply, …")
     _running(option)
 
 
@@ -318,7 +319,8 @@ def _remove(given: Namespace, shown: Reporter) -> None:
     if not given.quiet and given.progress == "bar":
         counts = summary["counts"]
         seconds = time.perf_counter() - start
-        words = f"removed {counts['removed']} and added {counts['added']} Gaussians in {seconds:.1f} s: {job.out}"
+        written = ", ".join(v["out"] for v in summary["variants"])
+        words = f"removed {counts['removed']} and added {counts['added']} Gaussians in {seconds:.1f} s: {written}"
         say(words, sys.stdout)
         if summary["verdict"]:
             say(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}", sys.stdout)

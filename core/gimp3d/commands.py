@@ -25,11 +25,20 @@ from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
-from .job import RemovalJob
+from .job import MOST_VARIANTS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
-from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
+from .pipeline import (
+    BEFORE_FILL,
+    RemovalResult,
+    RemovalSettings,
+    View,
+    look_behind,
+    preview,
+    remove_object,
+    render_bytes,
+)
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
@@ -39,9 +48,9 @@ from .stages.charts import Chart, chart_number
 from .stages.masks import MaskSettings, find_masks
 from .steps.completion import charts_to_paint
 from .steps.light import NOT_LIT
-from .store import StageStore
+from .store import SharedStages, StageStore
 from .stored import STORED
-from .summary import summary_of
+from .summary import summary_of, variant_facts
 from .view_state import ViewState
 
 PASSES = ("rgb", "alpha", "depth", "normal")
@@ -296,6 +305,10 @@ def run_removal(
     out = Path(job.out)
     if out.suffix.lower() != ".ply" and not is_stream(out):
         raise BadInput(f"--out: {out} must end in .ply")
+    if not 1 <= job.variants <= MOST_VARIANTS:
+        raise BadInput(f"--variants must be from 1 to {MOST_VARIANTS}, got {job.variants}")
+    if job.variants > 1 and is_stream(out):
+        raise BadInput(f"--variants: {out} takes one scene only")
     _try_targets(job, folder)
     progress("read", 0, 1, job.scene)
     file = read_scene(Path(job.scene))
@@ -314,27 +327,34 @@ def run_removal(
     extra = _read_marks("--extra-masks", job.extra_masks, cameras)
     shadow = _read_marks("--shadow-masks", job.shadow_masks, cameras)
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
-    store = None
-    if folder:
-        key = _job_key(job, views, (extra, shadow))
-        store = StageStore(folder / "stages", key, STORED, resume, asdict(settings))
-    result = remove_object(
-        scene,
-        views,
-        frame.region(region),
-        settings,
-        _clean_id(job.reference),
-        given,
-        progress,
-        store,
-        extra,
-        shadow,
-        allow_network,
-    )
-    result = replace(result, charts=_charts_back(result.charts, frame), proposed=_proposed(result.proposed, frame))
-    summary = summary_of(job, settings, file, result, warnings, time.perf_counter() - start)
-    _write_beside(job, folder, scene, views, result, summary)
-    write_ply(out, file, result.keep, frame.back(result.added))  # last: it is as it was until all has gone well
+    key = _job_key(job, views, (extra, shadow)) if folder else ""
+    shared = SharedStages(BEFORE_FILL if job.variants > 1 else ())
+    results: list[RemovalResult] = []
+    for variant in range(settings.variant, settings.variant + job.variants):
+        of_variant = replace(settings, variant=variant)
+        if folder:
+            stages = folder / "stages" / (str(variant + 1) if variant else "")
+            shared.own = StageStore(stages, key, STORED, resume, asdict(of_variant))
+        result = remove_object(
+            scene,
+            views,
+            frame.region(region),
+            of_variant,
+            _clean_id(job.reference),
+            given,
+            progress,
+            shared,
+            extra,
+            shadow,
+            allow_network,
+        )
+        charts, proposed = _charts_back(result.charts, frame), _proposed(result.proposed, frame)
+        results.append(replace(result, charts=charts, proposed=proposed))
+    summary = summary_of(job, settings, file, results[0], warnings, time.perf_counter() - start)
+    summary["variants"] = [variant_facts(path, result) for path, result in zip(job.outs(), results)]
+    _write_beside(job, folder, scene, views, results, summary)
+    for path, result in reversed(list(zip(job.outs(), results))):
+        write_ply(path, file, result.keep, frame.back(result.added))  # OUT last: as it was until all has gone well
     return summary
 
 
@@ -343,23 +363,23 @@ def _write_beside(
     folder: Path | None,
     scene: Gaussians,
     views: Sequence[View],
-    result: RemovalResult,
+    variants: Sequence[RemovalResult],
     summary: dict[str, Any],
 ) -> None:
     """What a removal writes beside OUT: views, charts, report, summary."""
     if job.views_out:
-        for name, image in result.painted.items():
+        for name, image in variants[0].painted.items():
             write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
-        write_charts(Path(job.views_out) / "charts", result.charts)
+        write_charts(Path(job.views_out) / "charts", variants[0].charts)
     if job.report:
-        write_removal_report(Path(job.report), scene, views, result, summary)
+        write_removal_report(Path(job.report), scene, views, variants, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_json(Path(path), summary)
 
 
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:
     """Sweep what killed runs left half-written, and see that everything can be written before the work starts."""
-    files = [Path(p) for p in (job.out, job.summary, folder and folder / "summary.json") if p]
+    files = [*job.outs(), *(Path(p) for p in (job.summary, folder and folder / "summary.json") if p)]
     folders = [Path(p) for p in (job.report, job.views_out, folder and folder / "stages") if p]
     sweep([*(f.parent for f in files), *folders])
     for path in files:

@@ -27,6 +27,7 @@ MOST_RECORDS = 1000  # of jobs that this user wrote on this machine
 COMMAND = "command:"
 PROVIDERS = ("inpaint", "depth_prior", "refine_views")  # fields and settings that may name a program, host or model
 WRITTEN = ("out", "report", "summary", "views_out")  # the paths of a job that are written
+MOST_VARIANTS = 16  # as many brushes as a setting may name
 SHADOWS = ("auto", "off", "mask")  # what the object's own shadow is taken for
 
 
@@ -56,6 +57,7 @@ class RemovalJob:
     threads: Annotated[int, Between(1, 1024)] | None = None
     seed: Annotated[int, Between(0, 2**32 - 1)] = 0
     grow: bool = False  # take along what of the object the boxes cut off
+    variants: Annotated[int, Between(1, MOST_VARIANTS)] = 1  # fills to choose from: OUT, OUT.2.ply, …
 
     PATHS = (
         *("scene", "cameras", "roi", "out", "images", "extra_masks", "shadow_masks"),
@@ -65,6 +67,11 @@ class RemovalJob:
     def resolved(self, folder: Path) -> RemovalJob:
         """The same job with its relative paths made absolute against `folder`."""
         return self._with_paths(lambda v: str(folder / v))
+
+    def outs(self) -> list[Path]:
+        """The scenes that are written: OUT.ply, OUT.2.ply and so on, one for each variant."""
+        out = Path(self.out)
+        return [out, *(out.with_suffix(f".{k}{out.suffix}") for k in range(2, self.variants + 1))]
 
     def relative_to(self, folder: Path) -> RemovalJob:
         """The same job with paths below `folder` made relative to it, so that the folder can move."""

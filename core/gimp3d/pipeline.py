@@ -34,6 +34,7 @@ __all__ = [
     "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look_behind", "preview",
     "provider_notices", "remove_object", "render_bytes",
 ]  # fmt: skip
+BEFORE_FILL = ("masks", "exposure", "surfaces", "light", "lift", "charts")  # stages that know nothing of fills
 REFINERS = ("command", "http", "https")  # who may be asked to refine views
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from .schema import Seed, Share
+from .schema import Seed, Share, Variant
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
@@ -36,6 +36,7 @@ class RemovalSettings:
     extra_references: int = 3  # views; completed after the first one, where it does not reach
     extra_gain: Share = 0.01  # share of the hole; that must still be open for an extra reference
     random_seed: Seed = 0  # number; another one gives another texture
+    variant: Variant = 0  # number; another one fills with another brush
     refine_views: str = ""  # provider; who is asked to refine painted views beside their reference, empty: nobody
     painter_seconds: float = 600.0  # s; that a painter or model outside this program may take for one picture
     prompt: str = ""  # words; what stands behind the object, for painters that read

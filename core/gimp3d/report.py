@@ -69,7 +69,7 @@ PAGE = Template(
 <p>$facts</p>
 $verdict$warnings
 <h2>Before and after</h2><div class=grid>$pairs</div>
-$flips
+$variants$flips
 <h2>Stages</h2>$stages
 $charts$references
 <h2>What each stage saw</h2><p>Filled views: raw, blended, and by which rule. $legend</p>
@@ -82,12 +82,11 @@ TURN = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k !=
 
 
 def write_removal_report(
-    folder: Path, scene: Gaussians, views: Sequence[View], result: RemovalResult, summary: dict[str, Any]
+    folder: Path, scene: Gaussians, views: Sequence[View], variants: Sequence[RemovalResult], summary: dict[str, Any]
 ) -> Path:
     """Write index.html and its pictures into `folder`; returns the page's path."""
-    kept = scene.take(result.keep)
-    after = kept if result.added is None else kept.extended(result.added)
-    parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": []}
+    result, after = variants[0], _filled(scene, variants[0])
+    parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
     for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
         names = (f"before_{k}.png", f"after_{k}.png")
         for name, gaussians in zip(names, (scene, after)):
@@ -98,6 +97,11 @@ def write_removal_report(
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
         write_png(folder / f"view_{k:02d}.png", image)
         parts["flips"].append(_figure(_image(f"view_{k:02d}.png"), camera_id, " hidden" if k else ""))
+    if len(variants) > 1:
+        view = max(views, key=lambda v: _touched(v, result))
+        for k, variant in enumerate(variants, 1):
+            write_png(folder / f"variant_{k}.png", render_bytes(_filled(scene, variant), view.camera))
+            parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
         write_png(folder / f"chart_{number}.png", draw(picture))
@@ -108,6 +112,17 @@ def write_removal_report(
     page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
+
+
+def _filled(scene: Gaussians, result: RemovalResult) -> Gaussians:
+    kept = scene.take(result.keep)
+    return kept if result.added is None else kept.extended(result.added)
+
+
+def _touched(view: View, result: RemovalResult) -> int:
+    """How many values of the view the removal changed."""
+    painted = result.painted.get(view.camera.id)
+    return 0 if painted is None else int((painted != view.image).sum())
 
 
 def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
@@ -271,6 +286,7 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
         verdict=_verdict(summary.get("verdict")),
         warnings="".join(f"<p class=warn>{escape(w)}</p>" for w in summary["warnings"]),
         pairs="".join(parts["pairs"]),
+        variants=f"<h2>Variants</h2><div class=grid>{''.join(fills)}</div>" if (fills := parts["variants"]) else "",
         flips=_flip_book(parts["flips"]),
         stages=_table(_rows(".n.n.", timed), "<tr><th>stage<th>time<th><th>confidence<th>what happened</tr>"),
         charts=_charts(result.charts, summary),

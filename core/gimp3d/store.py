@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -91,6 +91,29 @@ class StageStore:
             return Path(value["path"])
         members = {k: self._decode(v, arrays) for k, v in value["fields"].items()}
         return self.kinds[value["kind"]](**members)
+
+
+class SharedStages:
+    """The stages that variants of one removal have in common, in memory; the others go to each variant's own store."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names, self.results = names, dict[str, Any]()
+        self.own: StageStore | None = None
+
+    def load(self, name: str) -> Any | None:
+        if name not in self.results and self.own and (found := self.own.load(name)) is not None:
+            self._keep(name, found)
+            return found
+        return self.results.get(name)
+
+    def save(self, name: str, result: Any) -> None:
+        self._keep(name, result)
+        if self.own:
+            self.own.save(name, result)
+
+    def _keep(self, name: str, result: Any) -> None:
+        if name in self.names:
+            self.results[name] = result
 
 
 def _checksum(encoded: Any, arrays: Mapping[str, np.ndarray]) -> str:

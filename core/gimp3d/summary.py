@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,16 @@ def summary_of(
         "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
         "warnings": [*warnings, *result.warnings],
         "peak_memory_mb": round(peak_memory_mb(), 1),
+    }
+
+
+def variant_facts(out: Path, result: RemovalResult) -> dict[str, Any]:
+    """What the summary says of one of several fills."""
+    return {
+        "out": str(out),
+        "added": len(result.added) if result.added else 0,
+        "open_pixels": result.open_pixels,
+        "score": result.verdict.score if result.verdict else None,
     }
 
 

@@ -35,7 +35,7 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
         "settings": {"inpaint": "file:<x>"},
         "warnings": ["<script>alert(1)</script>"],
     }
-    page = write_removal_report(tmp_path, scene(), views, result, summary).read_text()
+    page = write_removal_report(tmp_path, scene(), views, (result,), summary).read_text()
     pictures = re.findall(r"src='([^']+)'", page)
     assert len(pictures) >= 2 * 4 + 6 and len(set(pictures)) == len(pictures)
     for name in pictures:

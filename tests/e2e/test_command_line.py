@@ -137,6 +137,35 @@ def test_a_job_runs_alone_moves_and_resumes(
     assert read_json(moved / "summary.json")["counts"]["added"] > 0
 
 
+def test_variants_are_other_fills_of_the_same_hole(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
+    out, job = tmp_path / "out.ply", ("--job", tmp_path / "job", "--summary", tmp_path / "s.json")
+    remove(scene_folder, out, *job, "--variants", 3, "--report", tmp_path / "report")
+    facts = read_json(tmp_path / "s.json")["variants"]
+    paths = [out, tmp_path / "out.2.ply", tmp_path / "out.3.ply"]
+    assert [f["out"] for f in facts] == [str(p) for p in paths]
+    scenes = [p.read_bytes() for p in paths]
+    assert scenes[0] == (completed / "out.ply").read_bytes()  # the first is what there is without variants
+    assert len(set(scenes)) == 3
+    kept = len(read_ply(out).gaussians) - facts[0]["added"]
+    for path, fact in zip(paths, facts):
+        assert len(read_ply(path).gaussians) == kept + fact["added"] > kept
+        assert 0 <= fact["score"] <= 1
+        assert str(path) in (tmp_path / "report" / "index.html").read_text()
+    for path in paths:
+        path.unlink()
+    remove(scene_folder, out, *job, "--variants", 3, "--resume")
+    assert [p.read_bytes() for p in paths] == scenes
+
+
+@pytest.mark.parametrize(("number", "out"), [(0, "out.ply"), (17, "out.ply"), (2, "/dev/null")])
+def test_variants_that_cannot_be_are_refused(
+    number: int, out: str, scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    remove(scene_folder, tmp_path / out, "--variants", number, expect=2)
+    assert "variants" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -> None:
     reference = cameras()[0]
     true = render_bytes(truth(), reference)

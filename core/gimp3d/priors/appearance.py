@@ -33,6 +33,7 @@ class Unfinished:
     disparity: np.ndarray | None = None  # [H, W] float32, 1/z of the surface, in the hole too; 0 = infinity or nothing
     K: np.ndarray | None = None  # [3, 3], known with the disparity
     unknown: np.ndarray | None = None  # [H, W] bool, pixels that mean nothing either, but are not to be filled
+    variant: int = 0  # another fill of the same hole, for people to choose from
 
 
 Provider = Callable[[Unfinished], Appearance]

@@ -14,6 +14,7 @@ from ..solvers.surface import tangent_planes
 from .appearance import Appearance, Provider, Unfinished, window_round_hole
 
 SPECK = 4  # px; smaller parts of a hole are interpolated
+PATCHES = (13, 21, 9)  # px, of variants in turn: larger ones continue larger figures, smaller ones fit closer
 CONFIDENCE_SCALE = 20.0  # grey levels of misfit at which the confidence has fallen to 1/e
 
 
@@ -39,7 +40,8 @@ def exemplar(view: Unfinished) -> Appearance:
         corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])
         surface = tangent_planes(view.disparity[near], view.K - corner)
     unknown = None if view.unknown is None else view.unknown[near]
-    done = complete_picture(view.image[near], view.hole[near], ExemplarSettings(seed=view.seed), surface, unknown)
+    settings = ExemplarSettings(PATCHES[view.variant % len(PATCHES)], seed=view.seed + view.variant)
+    done = complete_picture(view.image[near], view.hole[near], settings, surface, unknown)
     if np.isnan(done.misfit):
         return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))

@@ -45,6 +45,7 @@ def inpaint_reference(
     K: np.ndarray | None = None,  # [3, 3]
     unknown: np.ndarray | None = None,  # [H, W] bool, see Unfinished
     call: Call = Call(),
+    variant: int = 0,
 ) -> Appearance:
     """Fill the hole by the provider that `spec` names.
 
@@ -62,7 +63,7 @@ def inpaint_reference(
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
     if hole.all() and not spec.startswith("file:"):
         raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
-    filled = provider(Unfinished(image, hole, seed, disparity, K, unknown))
+    filled = provider(Unfinished(image, hole, seed, disparity, K, unknown, variant))
     return replace(filled, image=np.where(hole[..., None], filled.image, image))
 
 
@@ -105,7 +106,7 @@ def _painted(who: Painter, view: Unfinished, call: Call) -> Appearance:
     if who.notice:
         call.tell(who.notice)
     # what is not known means nothing to the painter either
-    picture = who.paint(image, hole | unknown, view.seed, call)
+    picture = who.paint(image, hole | unknown, view.seed + view.variant, call)
     done = paste_picture(image, hole, picture, who.answer, ~unknown)
     whole = view.image.copy()
     whole[part] = done.image

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..compute.jit import kernel
 from ..compute.threads import run_ranges
-from .edges import find_edges, guide_of
+from .edges import Edge, find_edges, guide_of
 from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
@@ -83,7 +83,6 @@ def complete_picture(
     """
     if not hole.any():
         return Completion(image.copy(), 0.0)
-    radius = settings.patch // 2
     asked, given = hole, image
     if unknown is None or (unknown | hole).all():
         unknown = np.zeros(hole.shape, bool)
@@ -96,18 +95,41 @@ def complete_picture(
         if (regular == hole).all():
             return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
         hole = hole & ~regular
+    # where photos disagree a little, what they show tells edges all the same
+    edges = () if surface is not None else find_edges(given, asked, ~asked & given.any(-1))
+    done = _by_patches(image, hole, unknown, edges, surface, settings)
+    if done is None:
+        return Completion(given.copy(), float("nan"))
+    level, field, colours = done
+    hole = level.hole
+    sources = image[field.rows[hole], field.cols[hole]]
+    misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
+    filled = image.copy()
+    filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
+    filled[~asked] = given[~asked]  # what was filled besides
+    return Completion(filled, misfit)
+
+
+def _by_patches(
+    image: np.ndarray,
+    hole: np.ndarray,
+    unknown: np.ndarray,
+    edges: tuple[Edge, ...],
+    surface: TangentPlanes | None,
+    settings: ExemplarSettings,
+) -> tuple[_Level, NearestNeighbourField, np.ndarray] | None:
+    """The finest level, its field and the hole's colours, level by level; None if there is nothing to copy."""
+    radius = settings.patch // 2
     patch = np.ones((settings.patch,) * 2, np.uint8)
     hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), patch) > 0))
     unknown = unknown & ~hole
     if surface is not None:  # what is filled is mixed with nothing
         surface = surface._replace(clear=surface.clear | hole)
-    # where photos disagree a little, what they show tells edges all the same
-    edges = () if surface is not None else find_edges(given, asked, ~asked & given.any(-1))
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
     if levels[-1][1].all():
-        return Completion(given.copy(), float("nan"))
+        return None
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
         there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
@@ -121,12 +143,7 @@ def complete_picture(
         level = _prepared(channels, open_, barred, np.float32(EDGE) * guide, there, radius, reach, settings)
         colours, field = _filled(level, field, rounds, settings)
     assert field is not None
-    sources = image[field.rows[hole], field.cols[hole]]
-    misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
-    filled = image.copy()
-    filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
-    filled[~asked] = given[~asked]  # what was filled besides
-    return Completion(filled, misfit)
+    return level, field, colours
 
 
 @dataclass(frozen=True)

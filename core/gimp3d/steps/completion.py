@@ -141,6 +141,7 @@ def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSet
         chart.camera.K,
         ~chart.known & ~hole,
         call,
+        settings.variant,
     )
 
 
@@ -208,6 +209,7 @@ def paint_view(
         disparity_of(depth),
         masks.camera.K,
         call=call,
+        variant=settings.variant,
     )
     share = seen.sum() / max(1, masks.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
