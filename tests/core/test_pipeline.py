@@ -14,7 +14,7 @@ from gimp3d.forecast import forecast_removal
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 
-IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "appearance", "seed", "mapping", "propagate", "settle"]
+IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "appearance", "seed", "propagate", "settle"]
 
 
 def views() -> list[View]:
