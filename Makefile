@@ -6,8 +6,8 @@ DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
-	bench-ablation bench-propagate bench-harmonics bench-nnf bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
-	bench-large bench-references bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
+	bench-ablation bench-propagate bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
+	bench-large bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -54,7 +54,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-harmonics bench-nnf bench-inpaint bench-pareto bench-stability
+bench: bench-raster bench-surface bench-poisson bench-depth bench-inpaint bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 bench-raster: $(READY)
@@ -75,12 +75,8 @@ bench-ablation: $(READY)
 
 # those of the way from the reference into the other views
 bench-propagate: $(READY)
-	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate --rules "the warp" \
-		retargeting "paper's sampling" "paper's blend" "in the picture"
-
-# 128 removals: an hour, so not part of bench
-bench-references: $(READY)
-	$(BIN)/python -m benchmarks.references $(DATA)
+	$(BIN)/python -m benchmarks.ablation $(DATA) --out build/bench_propagate \
+		--rules "the warp" "paper's sampling" "paper's blend"
 
 # every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
 bench-real: $(READY)
@@ -92,9 +88,6 @@ bench-light: $(READY)
 # one of the rules about the object's light switched off: make bench-light-rules RULE="hue is no paint"
 bench-light-rules: $(READY)
 	$(BIN)/python -m benchmarks.light $(DATA) --skip-removals --without "$(or $(RULE),a light need not beat chance)"
-
-bench-harmonics: $(READY)
-	$(BIN)/python -m benchmarks.harmonics
 
 # presets, ablations and baselines: half an hour
 bench-pareto: $(READY)
@@ -133,9 +126,6 @@ $(OTHERS)/.ready:
 	$(OTHERS)/bin/python -m pip install --quiet 'numpy<2' scikit-image==0.26.0 imageio
 	$(OTHERS)/bin/python -m pip install --quiet PyPatchMatch==2.2.0 || echo "PyPatchMatch cannot be installed here; it is left out"
 	@touch $@
-
-bench-nnf: $(READY) $(OTHERS)/.ready
-	$(BIN)/python -m benchmarks.nnf --others $(OTHERS)/bin/python
 
 bench-inpaint: $(READY) $(OTHERS)/.ready
 	$(BIN)/python -m benchmarks.fill --only photographs --out build/bench_inpaint --others $(OTHERS)/bin/python

@@ -16,7 +16,7 @@ import numpy as np
 
 from gimp3d.camera import output_name
 from gimp3d.errors import IllPosed
-from gimp3d.geometry import SOLID, disparity_of
+from gimp3d.geometry import disparity_of
 from gimp3d.priors.monodepth import DepthPrior
 from gimp3d.stages.depth import DepthSettings, complete_depth
 from gimp3d.stages.masks import ViewMasks, find_masks
@@ -87,7 +87,7 @@ def scene_cases(scene: Scene, most: int | None) -> Iterator[Row]:
         others = [v for v in masks.views if v.camera.id != camera.id]
         truth, unseen = scene.depth(camera), scene.unseen(camera)
         there = np.isfinite(truth) & (truth > 0)
-        known = rim(view, SOLID)
+        known = rim(view)
         ring = errors(view.depth_after, truth, known & (distance_to(view.target) <= RING) & there)
         for way, complete in ways(view, others, known, truth).items():
             try:

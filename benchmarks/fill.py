@@ -26,6 +26,7 @@ from structured import edge_error, structured
 
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.evaluate.metrics import score
+from gimp3d.geometry import bounds
 from gimp3d.io.images import write_png
 from gimp3d.priors.inpaint import inpaint_reference
 from gimp3d.solvers.exemplar import complete_picture
@@ -34,7 +35,7 @@ from .ablation import RULES, switched_off
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .photographs import OTHERS_PYTHON, REPETITIONS, SHARE, SLOW_S, blob, filled_by, photographs
 from .plots import COLOURS, FAINT, figure, name_ends
-from .tables import Row, Section, markdown, mean, values, where, window_round
+from .tables import Row, Section, markdown, mean, values, where
 from .timing import about, machine
 
 OURS, RIVALS = "gimp3d exemplar", ("PyPatchMatch, radius 2", "PyPatchMatch, radius 3")
@@ -114,7 +115,7 @@ def completed(
 
 
 def scores(filled: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> Row:
-    near = window_round(hole, SCORED_MARGIN)
+    near = bounds(hole, SCORED_MARGIN)
     filled, truth, hole = filled[near], truth[near], hole[near]
     inner = cv2.erode(hole.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     sharpness = slope(filled)[inner].mean() / slope(truth)[inner].mean()
@@ -129,7 +130,7 @@ def slope(picture: np.ndarray) -> np.ndarray:
 
 def strip(truth: np.ndarray, hole: np.ndarray, fills: Mapping[str, np.ndarray]) -> np.ndarray:
     """The hole and what was made of it, side by side; the truth last."""
-    near = window_round(hole, SHEET_MARGIN)
+    near = bounds(hole, SHEET_MARGIN)
     shown = {"hole": np.where(hole[..., None], np.uint8((255, 0, 255)), truth), **fills, "truth": truth}
     cells = []
     for name, picture in shown.items():

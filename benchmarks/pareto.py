@@ -1,15 +1,13 @@
 """What the new Gaussians are worth: presets, ablations and baselines by quality, time and count, on scenes with truth.
 
-Presets run whole. Ablations share stages: each is run once and counted for all. Kernels are compiled before anything
-is timed. Seconds hold all that a removal does; CPU seconds, of all threads, mean the same on a busy machine. Writes
-OUT/pareto.json, OUT/pareto.md and charts. Run by `make bench-pareto`.
+Kernels are compiled before anything is timed. Seconds hold all that a removal does; CPU seconds, of all threads, mean
+the same on a busy machine. Writes OUT/pareto.json, OUT/pareto.md and charts. Run by `make bench-pareto`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +29,6 @@ BALANCED = PRESETS["balanced"]
 METRICS = {"psnr mask": "{:.2f}", "ssim mask": "{:.3f}", "flip mask": "{:.3f}", "psnr unseen": "{:.2f}"}
 METRICS |= {"ssim unseen": "{:.3f}", "flip unseen": "{:.3f}", "agreement": "{:.2f}"}
 COSTS = {"added": "{:.0f}", "share": "{:.2f}", "seconds": "{:.1f}", "cpu seconds": "{:.1f}"}
-# What seeds' settings change; what comes before them is the same for all of ours.
-OWN_STAGES = ("seed", "propagate", "settle", "refine", "verdict")
 HUES = dict(zip(("presets", "paper", "ablations", "baselines"), COLOURS))
 
 
@@ -54,31 +50,7 @@ GROUPS: dict[str, dict[str, RemovalSettings]] = {
         for detail, largest in ((0, 1), (5, 4), (20, 4), (100, 4), (500, 8), (5000, 8))
     },
     "degrees": {f"degree {degree}": seeded(sh_degree=degree) for degree in range(4)},
-    "steps": {f"{n} steps": replace(BALANCED, refine=replace(BALANCED.refine, steps=n)) for n in (25, 200)},
 }
-WHOLE = ("paper", "presets")  # groups whose methods share nothing
-
-
-@dataclass
-class SharedStages:
-    """Keeps stages' results and seconds; those that a method makes for itself are made anew."""
-
-    kept: dict[str, tuple[Any, np.ndarray]] = field(default_factory=dict)
-    seconds: dict[str, np.ndarray] = field(default_factory=dict)  # stage → wall and CPU seconds, [2]
-    borrowed: np.ndarray = field(default_factory=lambda: np.zeros(2))  # of stages that another method has run
-    watch: Watch = field(default_factory=Watch)
-
-    def load(self, name: str) -> Any | None:
-        self.watch.lap()
-        if name in self.kept and not name.startswith(OWN_STAGES):
-            result, self.seconds[name] = self.kept[name]
-            self.borrowed = self.borrowed + self.seconds[name]
-            return result
-        return None
-
-    def save(self, name: str, result: Any) -> None:
-        self.seconds[name] = np.array(self.watch.lap()) / 1e3
-        self.kept[name] = (result, self.seconds[name])
 
 
 def main() -> None:
@@ -108,33 +80,37 @@ def main() -> None:
 
 def run(scene: Scene, groups: Mapping[str, Mapping[str, RemovalSettings]], only_compile: bool = False) -> list[Row]:
     """Every method on a scene; only_compile: with a single step of refinement, so that nothing timed compiles."""
-    rows, shared = [], SharedStages()
+    rows: list[Row] = []
+    removed = np.zeros(0, bool)
     for group, methods in groups.items():
         for method, settings in methods.items():
             if only_compile:
                 settings = changed(settings, [("refine.steps", min(1, settings.refine.steps))])
-            store = SharedStages() if group in WHOLE else shared
-            rows.append({"group": group, **measure(scene, method, settings, store)})
-            if method == "balanced":
-                shared = store
+            row, removed = measure(scene, method, settings)
+            rows.append({"group": group, **row})
             numbers = "".join(f"{rows[-1][k]:8.2f}" for k in ("psnr mask", "psnr unseen", "seconds", "cpu seconds"))
             say(f"{scene.name:8}{method:28}{numbers}{rows[-1]['added']:7}")
-    return rows if only_compile else [*rows, *baselines(scene, shared.kept["masks"][0].removed)]
+    return rows if only_compile else [*rows, *baselines(scene, removed)]
 
 
-def measure(scene: Scene, name: str, settings: RemovalSettings, store: SharedStages) -> Row:
-    store.seconds, store.borrowed = {}, np.zeros(2)
+def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np.ndarray]:
+    """A removal's row, and which Gaussians went, [N] bool."""
+    made: dict[str, Any] = {}
+
+    def watched(stage: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
+        made[stage] = work(*inputs)
+        return made[stage]
+
     reference, watch = scene.test[0], Watch()
-    result = removal(scene, settings, reference, scene.truth(reference), store=store)
-    wall, cpu = np.array(watch.lap()) / 1e3 + store.borrowed
+    result = removal(scene, settings, reference, scene.truth(reference), observer=watched)
+    wall, cpu = np.array(watch.lap()) / 1e3
     splats = filled(scene.gaussians, result)
-    first = store.kept["reference"][0].camera_id
-    hole = next(int(v.target.sum()) for v in store.kept["masks"][0].views if v.camera.id == first)
+    hole = next(int(v.target.sum()) for v in made["masks"].views if v.camera.id == made["reference"].camera_id)
     added = len(result.added or ())
     row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, hole)}
-    row |= {"stages": {s: float(spent[0]) for s, spent in store.seconds.items()}}
+    row |= {"stages": {s.name: s.seconds for s in result.stages}}
     row |= {"seconds": float(wall), "cpu seconds": float(cpu), "agreement": agreement(scene, splats, result)}
-    return row | scores(scene, {c.id: render_bytes(splats, c) for c in scene.test[1:]})
+    return row | scores(scene, {c.id: render_bytes(splats, c) for c in scene.test[1:]}), made["masks"].removed
 
 
 def agreement(scene: Scene, splats: Gaussians, result: RemovalResult) -> float:
@@ -182,7 +158,7 @@ def sections(rows: Sequence[Row]) -> Iterator[Section]:
             numbers = [form.format(row.get(k, math.nan)) for k, form in (METRICS | COSTS).items()]
             lines.append([row["scene"], row["method"], *numbers])
         yield Section(group, "", ["scene", "method", *METRICS, "added", "per px of T", "s", "CPU s"], lines)
-    timed = [r for r in average if r["group"] in WHOLE]
+    timed = [r for r in average if r["group"] in ("paper", "presets")]
     stages = list(dict.fromkeys(name for r in timed for name in r["stages"]))
     lines = [[r["method"], *(f"{r['stages'].get(s, 0.0):.2f}" for s in stages)] for r in timed]
     yield Section("Seconds per stage, means", "", ["method", *stages], lines)

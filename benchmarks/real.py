@@ -22,12 +22,13 @@ from gimp3d.commands import render_views
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.benchmark import empty_region, score_renders, telea
 from gimp3d.evaluate.metrics import psnr
+from gimp3d.geometry import bounds
 from gimp3d.io.images import read_image, read_mask, write_png
 from gimp3d.io.ply import read_ply, write_ply
 
 from .command import parser_of, say, told_in_one_line, write, write_results
 from .scenes import MADE, REAL, Scene, compile_kernels, gimp3d, read_scenes, remove_words, scene_words, shadow_words
-from .tables import Row, Section, distance_to, markdown, sheet, values, where, window_round
+from .tables import Row, Section, distance_to, markdown, sheet, values, where
 from .timing import about, machine
 
 SCENES = (*REAL, "kitchen_480")
@@ -269,7 +270,7 @@ def write_sheets(scene: Scene, renders: Path, target: Path) -> list[str]:
     if scene.has_truth:
         rows = [with_truth(scene, c, renders) for c in scene.test]
         masks = [scene.hides(c) for c in scene.test]
-        windows = [window_round(m, int(np.sqrt(m.sum()) / 2)) for m in masks]
+        windows = [bounds(m, int(np.sqrt(m.sum()) / 2)) for m in masks]
         close = [{words: picture[window] for words, picture in row.items()} for row, window in zip(rows, windows)]
         sheets = {f"{target.name}.png": rows, f"{target.name}.close.png": close}
     else:

@@ -179,19 +179,15 @@ def scores(scene: Scene, pictures: Mapping[str, np.ndarray]) -> dict[str, float]
     return {key: float(np.mean(found)) for key, found in rows.items()}
 
 
-def view_psnrs(scene: Scene, splats: Gaussians, cameras: Iterable[Camera]) -> dict[str, dict[str, float]]:
-    """ID of test view → PSNR in what the object hides, and in what no training view sees of it."""
-    found = {}
+def mean_psnrs(scene: Scene, splats: Gaussians, cameras: Iterable[Camera]) -> dict[str, float]:
+    """Means over test views of PSNR in what the object hides, and in what no training view sees of it."""
+    found: dict[str, list[float]] = {name: [] for name in MASKS}
     for camera in cameras:
         drawn, truth = render_bytes(splats, camera), scene.truth(camera)
-        masks = zip(MASKS, (scene.hides(camera), scene.unseen(camera)))
-        found[camera.id] = {name: psnr(drawn, truth, mask) for name, mask in masks if mask.any()}
-    return found
-
-
-def mean_psnrs(scene: Scene, splats: Gaussians, cameras: Iterable[Camera]) -> dict[str, float]:
-    views = list(view_psnrs(scene, splats, cameras).values())
-    return {name: float(np.mean([v[name] for v in views if name in v])) for name in MASKS}
+        for name, mask in zip(MASKS, (scene.hides(camera), scene.unseen(camera))):
+            if mask.any():
+                found[name].append(psnr(drawn, truth, mask))
+    return {name: float(np.mean(of)) for name, of in found.items()}
 
 
 def side_by_side() -> ProcessPoolExecutor:

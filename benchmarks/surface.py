@@ -18,7 +18,7 @@ import numpy as np
 from gimp3d.box import Region
 from gimp3d.camera import Camera, output_name
 from gimp3d.errors import BadInput, IllPosed
-from gimp3d.geometry import SOLID, disparity_of
+from gimp3d.geometry import disparity_of
 from gimp3d.io.images import write_png
 from gimp3d.report import tinted
 from gimp3d.stages.depth import DepthCompletion, complete_depth
@@ -212,7 +212,7 @@ def mask_scores(scene: Scene, masks: Masks) -> Row:
 def completed(view: ViewMasks, views: Sequence[ViewMasks]) -> DepthCompletion:
     """The surface behind the object in a view, as a removal with these training views completes it."""
     used = [v for v in views if v is view or v.camera.split == "train"]
-    return complete_depth(view, used, disparity_of(view.depth_after), rim(view, SOLID))
+    return complete_depth(view, used, disparity_of(view.depth_after), rim(view))
 
 
 def surface(view: ViewMasks, completion: DepthCompletion) -> np.ndarray:

@@ -82,15 +82,6 @@ def _tile(picture: np.ndarray, words: str, height: int, width: int) -> np.ndarra
     return tile
 
 
-def window_round(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """The mask's bounds with a margin in pixels, within the picture; all of it for an empty mask."""
-    if not mask.any():
-        return slice(None), slice(None)
-    rows, cols = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    row, col = (slice(max(0, i[0] - margin), i[-1] + 1 + margin) for i in (rows, cols))
-    return row, col
-
-
 def distance_to(mask: np.ndarray) -> np.ndarray:
     """Pixels to the nearest one of the mask, [H, W]; infinite where the mask is empty."""
     if not mask.any():

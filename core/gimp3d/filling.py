@@ -11,7 +11,7 @@ import numpy as np
 from . import pictures
 from .errors import IllPosed
 from .gaussians import Gaussians
-from .geometry import SAME_DEPTH, SOLID
+from .geometry import SAME_DEPTH
 from .run import Run, counted
 from .stages.charts import Chart
 from .stages.propagate import Reference
@@ -104,7 +104,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     """One view without the object; the program chooses it unless the user named one."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
     masks = [v.left for v in views]
-    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, SOLID, settings.reference, tried)
+    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
     run.references.append(choice)
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix
@@ -130,7 +130,8 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     if len(seeds) == 0:
         name = completed.camera.id
         raise IllPosed(f"reference {name}: what is behind the object is infinitely far; nothing to build")
-    field_ = run(f"mapping{suffix}", map_reference, completed, views, settings)
+    sampled = settings.propagate.transfer == "sample"
+    field_ = run(f"mapping{suffix}", map_reference, completed, views, settings) if sampled else None
     with_seeds = filled.extended(seeds)
     name = f"propagate{suffix}"
     painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
@@ -139,7 +140,7 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
     shown = [with_own_picture(p, completed) for p in painting.views]
     added = new if filling.added is None else filling.added.extended(new)
-    reference, filled = as_reference(completed, field_), filling.kept.extended(added)
+    reference, filled = as_reference(completed), filling.kept.extended(added)
     views = after_reference(views, shown, reference, filled, new, len(added), settings.masks)
     return replace(filling, views=views, added=added, done=(*filling.done, reference))
 

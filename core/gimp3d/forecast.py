@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 CHARTED = ("draft", "balanced", "best")  # presets that complete charts; others complete one view
 ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the former alone …
-ON_VIEWS = ("reference", "depth")  # … and of the latter
+ON_VIEWS = ("reference", "depth", "mapping")  # … and of the latter
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 STAGES = {

@@ -82,12 +82,12 @@ def of_depth(
     return shown
 
 
-def of_reference(completed: Completed, field: MappingField) -> list[Picture]:
+def of_reference(completed: Completed, field: MappingField | None) -> list[Picture]:
     image, name = completed.appearance.image, completed.camera.id
-    return [
-        Picture("appearance", f"The reference without the object, {name}", image, (completed.target,)),
-        Picture("mapping", f"Mapping field of {name}", image, (field.rows, field.cols)),
-    ]
+    shown = [Picture("appearance", f"The reference without the object, {name}", image, (completed.target,))]
+    if field is not None:
+        shown.append(Picture("mapping", f"Mapping field of {name}", image, (field.rows, field.cols)))
+    return shown
 
 
 def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Picture]:

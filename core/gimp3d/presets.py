@@ -6,15 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from .schema import Seed, Share, Variant
-from .solvers.harmonics import HarmonicsSettings
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
-from .stages.evidence import EvidenceSettings
 from .stages.mapping import MappingSettings
 from .stages.masks import MaskSettings
 from .stages.propagate import PropagateSettings
-from .stages.reference import ReferenceSettings
 from .stages.refine import RefineSettings
 from .stages.seed import SeedSettings
 from .stages.selection import SelectionSettings
@@ -27,8 +24,6 @@ class RemovalSettings:
     masks: MaskSettings = MaskSettings()
     charts: ChartSettings | None = ChartSettings()  # None: photos are the only references (paper)
     clearing: ClearingSettings = ClearingSettings()
-    reference: ReferenceSettings = ReferenceSettings()
-    evidence: EvidenceSettings = EvidenceSettings()
     depth: DepthSettings = DepthSettings()
     mapping: MappingSettings = MappingSettings()
     propagate: PropagateSettings = PropagateSettings()
@@ -55,9 +50,8 @@ PRESETS: dict[str, RemovalSettings] = {
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
         depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
-        mapping=MappingSettings(geometry=False),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
-        seed=SeedSettings(largest=1, corrections=0, sh_degree=3, harmonics=HarmonicsSettings(ridge=1e-3)),
+        seed=SeedSettings(largest=1, corrections=0, sh_degree=3),
         refine=RefineSettings(steps=3000, patience=120),
         shadow="off",
         use_evidence=False,

@@ -377,9 +377,5 @@ def _references(choices: Sequence[ReferenceChoice]) -> str:
             for name, s in zip(names, shown)
         )
         head = "<tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
-        plan = ", ".join(f"{escape(name)} ({share:.0%})" for name, share in choice.plan)
-        tables += (
-            f"{_table(_rows('.n.nnn', rows), head)}<p>{len(choice.scores)} candidates. Covered by the chosen view, "
-            f"then by the next best: {plan}</p>"
-        )
+        tables += f"{_table(_rows('.n.nnn', rows), head)}<p>{len(choice.scores)} candidates</p>"
     return f"<h2>Reference views</h2>{tables}" if tables else ""

@@ -111,7 +111,7 @@ def test_json_progress_ends_with_the_summary(
     remove(scene_folder, tmp_path / "out.ply", "--progress", "json")
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert all({"stage", "done", "total", "message"} <= set(line) for line in lines[:-1])
-    assert {"masks", "charts", "mapping", "propagate", "seed", "settle"} <= {line["stage"] for line in lines}
+    assert {"masks", "charts", "propagate", "seed", "settle"} <= {line["stage"] for line in lines}
     assert lines[-1]["stage"] == "done" and lines[-1]["summary"]["counts"]["removed"] > 0
 
 
@@ -130,7 +130,7 @@ def test_a_job_runs_alone_moves_and_resumes(
     job.rename(moved)
     for stage in ("find_masks", "exposures_of", "find_surfaces", "find_light", "chart_surfaces", "judge"):
         monkeypatch.setattr(pipeline, stage, again)
-    for stage in ("paint_chart", "seed_surface", "map_reference", "paint_views", "settle_seeds", "refine_gaussians"):
+    for stage in ("paint_chart", "seed_surface", "paint_views", "settle_seeds", "refine_gaussians"):
         monkeypatch.setattr(filling, stage, again)
     run("remove", "--job", moved, "--resume", "--progress", "none")
     assert (moved / "out.ply").read_bytes() == first
@@ -404,7 +404,7 @@ BAD = {  # the command, its exit code, and what its error says
     "a huge setting": (f"{REMOVE} --set masks.margin=1000000000", 2, "from 0 to 1000"),
     "charts of no pixels": (f"{REMOVE} --set charts.largest=0", 2, "charts.largest: must be from 1 to 1000, got 0"),
     "surroundings of no cells": (f"{REMOVE} --set surroundings.cells=0", 2, "no setting"),
-    "no samples": (f"{REMOVE} --set reference.samples=0", 2, "from 1 to"),
+    "no samples": (f"{REMOVE} --set depth.unknowns=0", 2, "from 1 to"),
     "an unknown word for a setting": (f"{REMOVE} --set masks.mode=some", 2, "need or paper expected"),
     "a file for a job": ("remove --job roi.json", 2, "job.json"),
     "a file for a new job": (f"{REMOVE} --job roi.json", 2, "cannot make the folder"),

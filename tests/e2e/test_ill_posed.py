@@ -32,7 +32,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import footprint, render
-from gimp3d.solvers.harmonics import sh_basis
+from gimp3d.sh import sh_basis
 from gimp3d.stages.mapping import mapping_field
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.reference import choose_reference
@@ -496,7 +496,7 @@ def assert_as_before(folder: Path) -> None:
     assert {p.name for p in folder.iterdir()} == {"scene.ply", "cameras.json", "roi.json", "out.ply"}
 
 
-@pytest.mark.parametrize("stage", ["read", "masks", "charts", "appearance", "seed", "mapping", "propagate", "settle"])
+@pytest.mark.parametrize("stage", ["read", "masks", "charts", "appearance", "seed", "propagate", "settle"])
 def test_files_are_as_before_a_run_that_is_cancelled(
     stage: str, remove: Remove, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -540,7 +540,7 @@ def test_a_crashed_run_goes_on_where_it_was(remove: Remove, monkeypatch: pytest.
     (folder / "summary.json").unlink()
     old_result(folder)
     job = folder.parent / "job"
-    crash = "import os, gimp3d.filling as f; f.map_reference = lambda *a, **b: os._exit(9)"
+    crash = "import os, gimp3d.filling as f; f.paint_views = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
     monkeypatch.setattr(pipeline, "find_masks", again)

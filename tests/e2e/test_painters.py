@@ -28,7 +28,7 @@ from gimp3d.priors.calls import Call
 from gimp3d.priors.inpaint import inpaint_reference, painter
 from gimp3d.priors.monodepth import depth_prior
 from gimp3d.stages.propagate import Rule
-from gimp3d.stages.refine import TRUST
+from gimp3d.stages.refine import PAINTED
 from gimp3d.stages.view_refinement import ViewToRefine, refine_views
 
 PAGE = (Path(__file__).parents[2] / "docs" / "painters.md").read_text(encoding="utf-8")
@@ -214,7 +214,7 @@ def test_painted_and_refined_views_reach_the_splats(tmp_path: Path, monkeypatch:
     for name in set(refined["views"]) - {refused}:
         changed = (seen[name].image != before[name]).any(-1)
         assert changed.sum() > 50 and (before[name] - seen[name].image).max() == 14
-        assert (seen[name].weight[changed] == TRUST[Rule.REFINED]).all() and seen[name].target[changed].all()
+        assert (seen[name].weight[changed] == PAINTED).all() and seen[name].target[changed].all()
 
 
 def test_depth_by_a_program_is_scaled_on_the_ring_of_a_named_view(tmp_path: Path) -> None:

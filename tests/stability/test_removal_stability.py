@@ -21,6 +21,7 @@ from scenes import REGION, cameras, scene, truth
 from scipy.ndimage import binary_dilation
 
 from benchmarks.perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
+from benchmarks.scenes import filled, mean_psnrs, read_scene, removal
 from benchmarks.stability import draw, report
 from gimp3d.camera import Camera
 from gimp3d.evaluate.metrics import psnr
@@ -204,3 +205,19 @@ def test_on_a_rendered_scene_it_bends_too(shared_data: Path, tmp_path: Path) -> 
     assert all(r["mask"] > r["open mask"] + 5 and r["largest"] < 0.5 for r in rows.values())
     assert rows["misplaced"]["mask"] > rows["none"]["mask"] - 1
     ElementTree.parse(tmp_path / "stability.svg")
+
+
+@pytest.mark.slow
+def test_two_true_pictures_give_nearly_the_same_removal(shared_data: Path) -> None:
+    desk = read_scene(shared_data / "withwithout" / "desk", needs_truth=True)
+    given = [removal(desk, PRESETS["draft"], camera, desk.truth(camera)) for camera in desk.test[:2]]
+    one, other = (mean_psnrs(desk, filled(desk.gaussians, result), desk.test[2:])["mask"] for result in given)
+    assert abs(one - other) < 1.1  # dB; σ of the two 0.8
+
+
+def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path) -> None:
+    out = str(tmp_path / "out")
+    command = [sys.executable, "-m", "benchmarks.stability", str(tmp_path), "--quick", "--out", out]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "has no truth/" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -9,7 +9,7 @@ and pixel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -30,7 +30,6 @@ BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a 
 TRUNCATION = 8.0  # px; offsets that differ by more are incoherent: coherence is local, not of the whole image
 GRID = 2  # px between the sources that the tree holds; sweeps look at those between
 TREE_SWEEPS = 2  # the first ones, which look into the neighbours' leaves of the tree
-SURFACE_SWEEPS = 3  # along a surface, after all others
 REACH = 4  # px, of the random search round the best source
 NO_LOOKS, NO_SUPPORT = np.empty(0, np.float32), np.empty((0, 0), np.uint8)
 IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
@@ -69,7 +68,6 @@ def nearest_neighbour_field(
     source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
     penalty: np.ndarray | None = None,  # [H, W] float32 ≥ 0, added to the cost of each source
     settings: PatchMatchSettings = PatchMatchSettings(),
-    surface: TangentPlanes | None = None,  # what the picture shows
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most.
 
@@ -77,9 +75,6 @@ def nearest_neighbour_field(
     difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
     scaled to [0, 1] (PixMix, Herling & Broll 2014). A source patch lies inside the image and holds no target
     pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
-
-    With a surface patches lie on its tangent planes, sources on other planes or of other orientations cost more, and
-    those seen more than twice as large or small are not taken – unless there is no other.
     """
     radius = settings.patch // 2
     while radius > 0 and not (source & patch_centres(~target, radius)).any():
@@ -88,18 +83,7 @@ def nearest_neighbour_field(
     allowed = source & patch_centres(~target, radius)
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
-    field = refined(None, patches, target, allowed, settings, extra, index)
-    if surface is None or not field.found.any():
-        return field
-    longer = replace(settings, sweeps=SURFACE_SWEEPS)
-    along = refined(field, patches, target, allowed, longer, extra, surface=surface, reach=max(target.shape) // 4)
-    kept = along.cost < IMPOSSIBLE
-    rows, cols, cost = (np.where(kept, a, b) for a, b in zip(_arrays(along), _arrays(field)))
-    return NearestNeighbourField(rows, cols, cost, radius)
-
-
-def _arrays(field: NearestNeighbourField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return field.rows, field.cols, field.cost
+    return refined(None, patches, target, allowed, settings, extra, index)
 
 
 def patch_centres(

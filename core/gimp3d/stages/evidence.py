@@ -10,18 +10,10 @@ import numpy as np
 
 from ..camera import Camera
 from ..geometry import EVIDENCE_DEPTH, colours_at, dilated, directions, sees, surface_points
-from ..schema import Share
 
 MARGIN = 3  # px round the sample that must not hold something nearer: photos mix colours at depth edges
 CONTACT = 4  # px that evidence keeps away from what no photo shows: where the object touches the surface
 NEARER = 0.03  # relative z by which a surface must be nearer to be one that mixes in: more than two splats' scatter
-
-
-@dataclass(frozen=True)
-class EvidenceSettings:
-    """When a photo counts as a true picture of the surface behind the object."""
-
-    tolerance: Share = EVIDENCE_DEPTH  # relative z; how near a photo must show the surface: more copies more, and wrong
 
 
 @dataclass(frozen=True)
@@ -37,7 +29,7 @@ def gather_evidence(
     depth: np.ndarray,  # [H, W] its completed z-depth
     target: np.ndarray,  # [H, W] bool, T_0
     views: Iterable[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, photo [H, W, 3], z with the object [H, W])
-    settings: EvidenceSettings = EvidenceSettings(),
+    tolerance: float = EVIDENCE_DEPTH,  # relative z, how near a photo must show the surface
 ) -> Evidence:
     """Colours of the hidden surface from the view that sees it unhidden under the most similar angle.
 
@@ -50,7 +42,7 @@ def gather_evidence(
     for other, photo, seen_depth in views:
         cosine = (rays * directions(points, other)).sum(-1)
         open_points = np.flatnonzero(cosine > best)
-        clear = sees(other, _off_edges(seen_depth), points[open_points], settings.tolerance)
+        clear = sees(other, _off_edges(seen_depth), points[open_points], tolerance)
         found = open_points[clear]
         if len(found):
             colours[found] = colours_at(photo, other.project(points[found])[0])

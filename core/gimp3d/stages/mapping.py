@@ -10,10 +10,9 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
-from ..geometry import SAME_DEPTH, disparity_of, pack_camera, project
+from ..geometry import SAME_DEPTH, pack_camera, project
 from ..schema import Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
-from ..solvers.surface import tangent_planes
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 
@@ -23,7 +22,6 @@ class MappingSettings:
     """How sources are judged."""
 
     visibility: Signed = 0.002  # squared colour difference, λ_v of eq. 8, (11 grey levels)²; likeness, what views see
-    geometry: bool = True  # patches lie on the surface; the paper's lie in the picture
     as_printed: bool = False  # compared at f(p), copied from p + f(p); nothing: the paper's cost misses p
     patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
@@ -65,8 +63,6 @@ def mapping_field(
     visibility: np.ndarray,  # [H, W] float32, see source_visibility
     settings: MappingSettings = MappingSettings(),
     seed: int = 0,
-    camera: Camera | None = None,
-    depth: np.ndarray | None = None,  # [H, W] z-depth of the completed reference, 0 = nothing
 ) -> MappingField:
     """The field f* that minimises misfit, incoherence and λ_v (1 − v) over T_0 (paper eq. 8, sign mended).
 
@@ -74,10 +70,7 @@ def mapping_field(
     """
     penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
     patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
-    surface = None
-    if settings.geometry and camera is not None and depth is not None:
-        surface = tangent_planes(disparity_of(depth), camera.K)
-    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch, surface)
+    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
     if settings.as_printed:
         nearest = _moved_by_places(nearest, source)
     found = nearest.found

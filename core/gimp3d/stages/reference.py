@@ -12,22 +12,14 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
-from ..schema import Many
 from ..solvers.planes import RING
 from .depth import DepthSettings, complete_disparity
 from .masks import ViewMasks
 
+SAMPLES = 2000  # of the hidden surface from each view, about
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
-MOST_EXTRA = 8  # further references that a plan looks ahead
 # Where the hidden surface is, about: coarse and fast.
 PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)
-
-
-@dataclass(frozen=True)
-class ReferenceSettings:
-    """How the choice of a reference is made."""
-
-    samples: Many = 2000  # points; of the hidden surface from each view, about: a steadier choice for more time
 
 
 @dataclass(frozen=True)
@@ -47,14 +39,13 @@ class ReferenceChoice:
 
     camera_id: str
     scores: tuple[ViewScore, ...]  # of every candidate, best first
-    plan: tuple[tuple[str, float], ...]  # the chosen view, then greedily the next: (camera ID, share covered by then)
     confidence: float
     reason: str
 
 
-def rim(view: ViewMasks, solid: float = SOLID) -> np.ndarray:
+def rim(view: ViewMasks) -> np.ndarray:
     """[H, W] bool: pixels whose depth after the removal is trusted."""
-    return ~view.target & (view.alpha_after > solid) & (view.depth_after > 0)
+    return ~view.target & (view.alpha_after > SOLID) & (view.depth_after > 0)
 
 
 @dataclass(frozen=True)
@@ -66,12 +57,13 @@ class NeededSurface:
 
 
 def needed_surface(
-    views: Sequence[ViewMasks], solid: float = SOLID, settings: ReferenceSettings = ReferenceSettings()
+    views: Sequence[ViewMasks],
+    samples: int = SAMPLES,  # from each view
 ) -> NeededSurface:
     """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
     seeing = [v for v in views if v.target.any()]
     step = max(1, -(-len(seeing) // SURFACE_VIEWS))
-    parts = parallel_map(lambda v: _surface_in(v, solid, settings), seeing[::step], most=2)  # mostly Python's work
+    parts = parallel_map(lambda v: _surface_in(v, samples), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
         return NeededSurface(points, normals)
@@ -81,12 +73,12 @@ def needed_surface(
     return NeededSurface(points[np.sort(first)], normals[np.sort(first)])
 
 
-def _surface_in(view: ViewMasks, solid: float, settings: ReferenceSettings) -> tuple[np.ndarray, ...]:
+def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
     """Points and normals [M, 3] in the world and their spacing [M, 1], from one view's hole; none if it has no rim."""
-    camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / settings.samples))))
+    camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / samples))))
     target, depth = view.target[part], view.depth_after[part]
     try:
-        completed = complete_disparity(disparity_of(depth), rim(view, solid)[part], target, settings=PROVISIONAL)
+        completed = complete_disparity(disparity_of(depth), rim(view)[part], target, settings=PROVISIONAL)
     except IllPosed:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
     depth = np.where(target, completed.depth, depth)
@@ -115,29 +107,26 @@ def _coarse(view: ViewMasks, step: int) -> tuple[Camera, tuple[slice, slice]]:
 def choose_reference(
     views: Sequence[ViewMasks],
     wanted: str | None = None,
-    solid: float = SOLID,
-    settings: ReferenceSettings = ReferenceSettings(),
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
     """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
 
     Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
-    the best view of it: 1 is a view that shows everything as well as any does. The plan goes on greedily with the
-    views that cover most of what the ones before do not.
+    the best view of it: 1 is a view that shows everything as well as any does.
 
     Raises
     ------
     IllPosed
         If the wanted view does not see the hole, or no view does.
     """
-    surface = needed_surface(views, solid, settings)
+    surface = needed_surface(views)
 
     def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
         return _seen(view, surface) if view.target.any() else None
 
     seen = parallel_map(shown_in, views, most=2)
     untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
-    candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and _has_rim(v, solid)]
+    candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and (dilated(v.target, 1) & rim(v)).any()]
     if not candidates:
         raise IllPosed("no view shows the surface behind the object; add views from which its surroundings are seen")
     best_worth = np.max([cosine * density for _, cosine, density in candidates], axis=0)
@@ -153,15 +142,12 @@ def choose_reference(
     if wanted is not None and wanted not in {s.camera_id for s in scores}:
         raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
     chosen = next(s for s in scores if wanted in (None, s.camera_id))
-    plan = _plan({v.camera.id: cosine > 0 for v, cosine, _ in candidates}, scores, chosen.camera_id)
     how = "as asked" if wanted else "explains most of the hidden surface"
     reason = (
         f"{chosen.camera_id}: {how}: shows {chosen.covered:.0%} of it, facing it by cos {chosen.facing:.2f}, with "
         f"{chosen.detail:.0%} of the finest detail (score {chosen.score:.2f}, best {scores[0].score:.2f})"
     )
-    if len(plan) > 1:
-        reason += "; then " + ", ".join(f"{name} to {share:.0%}" for name, share in plan[1:3])
-    return ReferenceChoice(chosen.camera_id, tuple(scores), plan, chosen.score / scores[0].score, reason)
+    return ReferenceChoice(chosen.camera_id, tuple(scores), chosen.score / scores[0].score, reason)
 
 
 def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
@@ -174,20 +160,3 @@ def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarr
     found = np.zeros((2, len(cosine)))
     found[:, index] = cosine[index], cosine[index] * camera.fx * camera.fy / z**2
     return found[0], found[1]
-
-
-def _has_rim(view: ViewMasks, solid: float) -> bool:
-    """Whether anything known bounds the hole."""
-    return bool((dilated(view.target, 1) & rim(view, solid)).any())
-
-
-def _plan(shown: dict[str, np.ndarray], scores: Sequence[ViewScore], first: str) -> tuple[tuple[str, float], ...]:
-    """The views that cover most, one after the other (greedy maximum coverage, Nemhauser 1978)."""
-    order = {s.camera_id: k for k, s in enumerate(scores)}
-    open_, name, plan = np.ones(len(shown[first]), bool), first, []
-    while True:
-        open_ &= ~shown[name]
-        plan.append((name, float(1 - open_.mean())))
-        name = max(order, key=lambda n: ((shown[n] & open_).sum(), -order[n]))
-        if not (shown[name] & open_).any() or len(plan) > MOST_EXTRA:
-            return tuple(plan)

@@ -23,8 +23,8 @@ V = TypeVar("V")
 WINDOW, SIGMA = 11, 1.5  # of SSIM, as 3DGS and the evaluation take it
 STEADY, STEADIER = 0.01**2, 0.03**2  # SSIM's C1 and C2, by which dark and flat parts count little
 SSIM = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
-NORMAL, DISTORTION = 0.05, 10.0  # weights of normal consistency and depth distortion, surfels only (Huang 2024)
 MARGIN = 4  # px of known picture round the target that counts as well: no visible seam
+PAINTED = 0.5  # how far a painted pixel is believed, beside one of a photo
 HELD_OUT = 8  # every so many views is not learned from; it says when to stop
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 # Its learning rates: 3DGS's, those of shapes lower as there are few steps; of means in the Gaussians' median size.
@@ -52,27 +52,14 @@ class Observation:
     weight: np.ndarray  # [H, W] float32 ≥ 0, how far each pixel is trusted
 
 
-# How far a painted pixel is believed, by the rule that gave its colour.
-TRUST = {
-    Rule.EVIDENCE: 1.0,
-    Rule.REFINED: 0.5,
-    Rule.OWN_PIXELS: 0.5,
-    Rule.RETARGETED: 0.5,
-    Rule.OTHER_VIEW: 0.25,
-    Rule.REFERENCE: 0.25,
-}
-
-
 def observed(
     camera: Camera,
     image: np.ndarray,  # [H, W, 3] uint8, the painted view
     rules: np.ndarray,  # [H, W] uint8, see Rule
 ) -> Observation:
-    """What a painted view tells: its hole, each pixel as far as its rule is believed."""
-    weights = np.zeros(max(Rule) + 1, np.float32)
-    for rule, weight in TRUST.items():
-        weights[rule] = weight
-    return Observation(camera, image, rules != Rule.UNTOUCHED, weights[rules])
+    """What a painted view tells of its hole."""
+    weight = np.where(rules == Rule.EVIDENCE, 1.0, PAINTED) * ~np.isin(rules, (Rule.UNTOUCHED, Rule.UNREACHED))
+    return Observation(camera, image, rules != Rule.UNTOUCHED, weight.astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -172,10 +159,9 @@ class _View:
     """A view's part of the loss: what does not change between steps is prepared once."""
 
     def __init__(self, frozen: Gaussians, observation: Observation) -> None:
-        self.surfels, self.camera = frozen.is_surfels, observation.camera
+        self.camera = observation.camera
         counted = dilated(observation.target, MARGIN)
-        passes = {"rgb", "alpha"} | ({"normal", "distortion", "expected_depth"} if self.surfels else set())
-        self.region: PixelRegion = pixel_region(frozen, observation.camera, counted, passes=frozenset(passes))
+        self.region: PixelRegion = pixel_region(frozen, self.camera, counted, passes=frozenset({"rgb", "alpha"}))
         self.window = bounds(counted, WINDOW // 2)
         # Round the target the photo itself counts fully.
         weight = (np.where(observation.target, observation.weight, 1.0) * counted)[self.window]
@@ -184,7 +170,6 @@ class _View:
         self.counted = counted[self.window]
         self.mean = _blurred(self.image)
         self.variance = _blurred(self.image**2) - self.mean**2
-        self.rays = _rays(observation.camera)[self.window].astype(np.float32) if self.surfels else None
 
     def loss(self, active: Gaussians) -> float:
         return self.judged(self.region.render(active))[0]
@@ -202,22 +187,9 @@ class _View:
         likeness, uphill = self._ssim(rgb, share)
         loss = (1 - SSIM) * float((np.abs(off) * share).sum()) + SSIM * float(((1 - likeness) * share).sum())
         slope = (1 - SSIM) * np.sign(off) * share - SSIM * uphill
-        slopes = {"rgb": slope * (self.counted[..., None] & (part >= 0) & (part <= 1))}
-        if self.rays is not None:
-            normals, depth = drawn.normals[self.window], drawn.expected_depth[self.window]
-            across, normals_slope, depth_slope = _misalignment(normals, depth, self.rays, self.share)
-            loss += NORMAL * across
-            loss += DISTORTION * float((drawn.distortion[self.window] * self.share).sum())
-            slopes["normals"] = NORMAL * normals_slope
-            slopes["expected_depth"] = NORMAL * depth_slope
-            slopes["distortion"] = DISTORTION * self.share
-        return loss, PictureGradients(**{name: self._whole(values) for name, values in slopes.items()})
-
-    def _whole(self, values: np.ndarray) -> np.ndarray:
-        """A picture that is 0 outside of the window."""
-        picture = np.zeros((self.camera.height, self.camera.width, *values.shape[2:]), np.float32)
-        picture[self.window] = values
-        return picture
+        picture = np.zeros((self.camera.height, self.camera.width, 3), np.float32)
+        picture[self.window] = slope * (self.counted[..., None] & (part >= 0) & (part <= 1))
+        return loss, PictureGradients(rgb=picture)
 
     def _ssim(self, rgb: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The SSIM map [h, w, 3] (Wang 2004), and the gradient of Σ share · SSIM with respect to rgb."""
@@ -238,46 +210,3 @@ def _blurred(picture: np.ndarray) -> np.ndarray:
     """Under SSIM's window, black all round; it is its own adjoint."""
     kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
     return cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
-
-
-def _rays(camera: Camera) -> np.ndarray:
-    """Points at depth 1 that the pixels show, [H, W, 3] in camera axes."""
-    flat = (camera.pixel_centres() - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], -1)
-
-
-def _misalignment(
-    drawn: np.ndarray,  # [h, w, 3] normals of the surfels
-    depth: np.ndarray,  # [h, w]
-    rays: np.ndarray,  # [h, w, 3]
-    share: np.ndarray,  # [h, w]
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Σ share (1 − n·N), N the depth map's normals (Huang 2024, eq. 16), and its gradients by n and by the depth."""
-    points = rays * depth[..., None]
-    right, down = np.gradient(points, axis=1), np.gradient(points, axis=0)
-    normals, length = _facing(right, down)
-    loss = float((share * (1 - (drawn * normals).sum(-1))).sum())
-    towards = -share[..., None] * drawn
-    towards = (towards - normals * (normals * towards).sum(-1, keepdims=True)) / length
-    slope = _gradient_adjoint(np.cross(towards, down), 1) + _gradient_adjoint(np.cross(right, towards), 0)
-    return loss, -share[..., None] * normals, (slope * rays).sum(-1)
-
-
-def _facing(right: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals [h, w, 3] of a surface by its slopes, facing the camera, and the length before [h, w, 1]."""
-    across = np.cross(down, right)
-    length = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
-    return across / length, length
-
-
-def _gradient_adjoint(values: np.ndarray, axis: int) -> np.ndarray:
-    """The transpose of np.gradient along an axis."""
-    g = np.moveaxis(values, axis, 0)
-    out = np.zeros_like(g)
-    out[2:] += g[1:-1] / 2
-    out[:-2] -= g[1:-1] / 2
-    out[1] += g[0]
-    out[0] -= g[0]
-    out[-1] += g[-1]
-    out[-2] -= g[-1]
-    return np.moveaxis(out, 0, axis)

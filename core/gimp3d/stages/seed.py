@@ -18,7 +18,7 @@ from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals, w
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
 from ..sh import sh_basis
-from ..solvers.harmonics import HarmonicsSettings, fit_harmonics, gather_observations
+from ..solvers.harmonics import HarmonicsSettings, fit_harmonics
 from .propagate import PaintedView, Rule
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
@@ -41,11 +41,9 @@ class SeedSettings:
     largest: Annotated[int, Between(1, 64)] = 4  # px, a power of two, side of a patch; fewer splats (paper: 1 px each)
     detail: float = 20.0  # squared grey levels × px that a patch may vary by; fewer splats against sharp ones
     opacity: Annotated[float, Between(0.01, 0.999)] = 0.98  # of new splats; what they hide against gradients to refine
-    corrections: int = 1  # steps of least squares, 0: all stay as seeded (paper); time against seams and dark views
+    corrections: int = 1  # steps of least squares, 0: the fit at the centres (paper); time against seams and dark views
     sh_degree: Annotated[int, Between(0, 3)] = 2  # highest of new splats; size against gloss
-    # Painted views err together, which leaving one out cannot see: all of them are worth few observations. And what
-    # they share against the reference is mostly a shadow or an exposure that it has not.
-    harmonics: HarmonicsSettings = HarmonicsSettings(offset=True)
+    harmonics: HarmonicsSettings = HarmonicsSettings()
     grey: float = 0.5  # of white, what 3DGS adds to Σ h_k Y_k; the paper's h_0 = c_0 / Y_0 takes nothing off for it
 
 
@@ -234,15 +232,17 @@ def colour_gaussians(
     scene_degree: int,
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
-    """The seeds with view-dependent colour fitted to the painted views; c_0 stays what the reference shows."""
+    """The seeds with as many coefficients as the scene's Gaussians have.
+
+    The paper fits them here, to the painted views at the seeds' centres; else they are 0 until `settle_gaussians`.
+    """
     degree, bands = min(settings.sh_degree, scene_degree), (scene_degree + 1) ** 2
     sh = seeds.sh
-    if degree > 0:
+    if degree > 0 and not settings.corrections:
         means = seeds.means.astype(np.float64)
         seen = parallel_map(lambda pair: _seen_in(means, *pair), zip(views, painted))
         colours = 0.5 + SH_C0 * sh[:, 0].astype(np.float64)
-        observations = gather_observations(len(seeds), seen)
-        sh = fit_harmonics(colours, directions(means, reference), observations, degree, settings.harmonics).sh
+        sh = fit_harmonics(colours, directions(means, reference), seen, degree, settings.harmonics)
     sh = pad_sh(sh, bands).copy()
     sh[:, 0] += (0.5 - settings.grey) / SH_C0
     return replace(seeds, sh=sh)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy.special import ndtri
 
 from ..box import Region, in_region
 from ..camera import Camera
-from ..compute.threads import parallel_map, run_ranges
-from ..gaussians import Gaussians, quats_to_matrices
+from ..compute.threads import parallel_map
+from ..gaussians import Gaussians
 from ..geometry import dilated, surface_points
 from ..raster import label_weights
 from ..schema import Share
@@ -22,18 +21,15 @@ from .growth import LEAST_WEIGHT, Growth, find_growth
 from .look import ViewBefore
 from .outline import box_window
 from .surroundings import THICKNESS, FollowedSurface, follow_surface
+from .witness import total_over
 
-R = TypeVar("R")
-STRADDLE = 0.02  # share of a Gaussian's mass in the region from which it reaches in
-MOSTLY = 0.5  # share of its mass, or of its weight, that decides: the majority
-LARGE = 0.5  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
+MOSTLY = 0.5  # share of a Gaussian's weight that decides: the majority
+LARGE = 0.5  # longest standard deviation of a giant, as a share of the shortest edge of the boxes
 SLACK = 1.0  # how far outside the boxes surface may still be the object's, cells of the followed surface
 RIM = 2.0  # width of the ring round the object where its colours may have run, cells of the followed surface
 LEAST_OBJECT = 0.002  # share of the region's outline that an object fills in some view to stand in a box
 LEAST_CELLS = 4.0  # of the followed surface along a box; in coarser ones a Gaussian's centre decides
 NEAR = 0.5  # how far from a box what only the removal reveals is looked for, as a share of the box's longest edge
-BATCH = 32  # views whose weights are held at once
-PLASTIC = 1.2207440846057596  # the real root of x⁴ = x + 1
 
 
 class Fate(IntEnum):
@@ -41,13 +37,12 @@ class Fate(IntEnum):
 
     OUTSIDE = 0  # stays: does not reach the region, or cannot be drawn
     KEPT_STRADDLING = 1  # stays: reaches in, but shows elsewhere
-    KEPT_LARGE = 2  # stays: its centre lies inside, but it is as large as the region and shows elsewhere
-    KEPT_SURFACE = 3  # stays: inside, but seen unhidden on surface that runs on from outside
-    REMOVED_INSIDE = 4  # goes: inside
-    REMOVED_STRADDLING = 5  # goes: reaches in and shows on the object
-    REMOVED_REVEALED = 6  # goes: near, and only the removal would show it
-    REMOVED_MASKED = 7  # goes: shows under the extra masks
-    REMOVED_GROWN = 8  # goes: of the object, though the region cut it off
+    KEPT_SURFACE = 2  # stays: inside, but seen unhidden on surface that runs on from outside, or a giant
+    REMOVED_INSIDE = 3  # goes: inside
+    REMOVED_STRADDLING = 4  # goes: reaches in and shows on the object
+    REMOVED_REVEALED = 5  # goes: near, and only the removal would show it
+    REMOVED_MASKED = 6  # goes: shows under the extra masks
+    REMOVED_GROWN = 7  # goes: of the object, though the region cut it off
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,6 @@ class Selection:
         stay = [
             f"{self.count(Fate.KEPT_SURFACE)} of floor or wall",
             f"{self.count(Fate.KEPT_STRADDLING)} straddlers",
-            f"{self.count(Fate.KEPT_LARGE)} large ones",
         ]
         parts = [", ".join(p for p in part if not p.startswith("0 ")) or "none" for part in (gone, stay)]
         return f"{int(self.removed.sum())} Gaussians go ({parts[0]}), in the region stay {parts[1]}"
@@ -281,61 +275,39 @@ def weigh(
     sightings: Sequence[Sighting],
 ) -> Weights:
     """Where each Gaussian shows while the object is there: one pass per view."""
-    sums = np.zeros((4, len(gaussians)))
+    empty = np.zeros((2, len(gaussians)))
 
-    def of(view: Sighting) -> tuple[np.ndarray, np.ndarray]:
+    def of(view: Sighting) -> np.ndarray:
         rows = np.ones(len(gaussians), bool) if view.masked else near
-        weights = label_weights(gaussians, view.camera, view.shows, Shows.MASKED if view.masked else Shows.CLEAR, rows)
-        return np.flatnonzero(rows), weights[:, rows]
+        last = Shows.MASKED if view.masked else Shows.CLEAR
+        object_, clear, *masked = label_weights(gaussians, view.camera, view.shows, last, rows)
+        return np.stack([object_, clear, masked[0], object_ + clear] if masked else [object_, clear, *empty])
 
-    for rows, (object_, clear, *masked) in _in_batches(of, sightings):
-        sums[0, rows] += object_
-        sums[1, rows] += clear
-        for under in masked:
-            sums[2, rows] += under
-            sums[3, rows] += object_ + clear
-    return Weights(*sums)
-
-
-def _in_batches(work: Callable[[Sighting], R], views: Sequence[Sighting]) -> Iterator[R]:
-    """parallel_map, of which only some results are there at a time."""
-    for start in range(0, len(views), BATCH):
-        yield from parallel_map(work, views[start : start + BATCH])
+    return Weights(*total_over(sightings, of, (4, len(gaussians))))
 
 
 def select(
-    gaussians: Gaussians,
-    region: Region,
-    weights: Weights,
-    surroundings: Sequence[FollowedSurface],
+    gaussians: Gaussians, region: Region, weights: Weights, surroundings: Sequence[FollowedSurface]
 ) -> Selection:
     """Every Gaussian's fate from where it lies and where it shows.
 
-    Inside: mass mostly in the region; it goes unless it shows cleanly on surface that runs on from outside.
-    Straddling: the rest of what reaches in; it goes if it shows mostly on the object, so that neither a halo is left
-    nor a black hole opened. What shows nowhere is judged by its centre.
+    Inside, it goes unless it shows mostly elsewhere and is surface that runs on from outside, or a giant of the
+    background. What else reaches in goes if it shows mostly on the object: neither a halo is left nor a black hole
+    opened.
     """
     shown = weights.object_ + weights.clear
-    on_object = weights.object_ / np.maximum(shown, 1e-9)
+    on_object = weights.object_ > MOSTLY * shown
     visible = shown > LEAST_WEIGHT
-    centre = select_removed(gaussians, region)
-    usable = gaussians.usable
-    rows = np.flatnonzero(_reaches(gaussians, region) & usable)
-    mass = np.zeros(len(gaussians))
-    mass[rows] = mass_inside(gaussians, rows, region)
+    centre, usable = select_removed(gaussians, region), gaussians.usable
     fates = np.zeros(len(gaussians), np.uint8)
-    straddling = ~centre & (mass >= STRADDLE)
-    fates[straddling] = Fate.KEPT_STRADDLING
-    fates[straddling & visible & (on_object > MOSTLY)] = Fate.REMOVED_STRADDLING
+    astride = _reaches(gaussians, region) & usable & ~centre
+    fates[astride] = np.where((visible & on_object)[astride], Fate.REMOVED_STRADDLING, Fate.KEPT_STRADDLING)
     fates[centre] = Fate.REMOVED_INSIDE
-    elsewhere = centre & (mass < MOSTLY) & visible & (on_object <= MOSTLY)
-    large = gaussians.scales.max(1) > LARGE * min(box.size.min() for box in region)
-    fates[elsewhere] = np.where(large[elsewhere], Fate.KEPT_LARGE, Fate.KEPT_STRADDLING)
-    inside = np.flatnonzero(fates == Fate.REMOVED_INSIDE)
-    clean = visible[inside] & (on_object[inside] <= MOSTLY)
+    elsewhere = np.flatnonzero(centre & visible & ~on_object)
+    stays = gaussians.scales[elsewhere].max(1) > LARGE * min(box.size.min() for box in region)
     for part in surroundings:
-        surface = np.isfinite(part.distance(gaussians.means[inside].astype(np.float64)))
-        fates[inside[surface & clean]] = Fate.KEPT_SURFACE
+        stays |= np.isfinite(part.distance(gaussians.means[elsewhere].astype(np.float64)))
+    fates[elsewhere[stays]] = Fate.KEPT_SURFACE
     under_masks = weights.masked > np.maximum(LEAST_WEIGHT, MOSTLY * (weights.masked + weights.unmasked))
     fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
@@ -353,14 +325,12 @@ def weigh_revealed(
     """
     stays = ~selection.removed
     kept, wanted = gaussians.take(stays), near[stays]
-    total = np.zeros(len(gaussians))
-    rows = np.flatnonzero(stays)[wanted]
 
     def of(view: Sighting) -> np.ndarray:
-        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0, wanted]
+        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0]
 
-    for part in _in_batches(of, sightings):
-        total[rows] += part
+    total = np.zeros(len(gaussians))
+    total[stays] = np.where(wanted, total_over(sightings, of, (len(kept),)), 0)
     return total
 
 
@@ -389,33 +359,6 @@ def _surrounds(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.n
         local = (gaussians.means - box.center) @ box.axes
         found |= (np.abs(local) < box.size / 2 + near * box.size.max()).all(1)
     return found
-
-
-def mass_inside(
-    gaussians: Gaussians,
-    rows: np.ndarray,  # [M] indices of usable rows
-    region: Region,
-    samples: int = 128,
-) -> np.ndarray:
-    """[M]: the share of each Gaussian's integral that lies in the region.
-
-    Quasi-Monte Carlo over an additive recurrence with the generalised golden ratio (Roberts 2018).
-    """
-    uniform = (0.5 + np.outer(np.arange(samples), PLASTIC ** -np.arange(1.0, 4.0))) % 1
-    normal = ndtri(uniform)
-    inside = np.empty(len(rows))
-
-    def work(lo: int, hi: int) -> None:
-        part = rows[lo:hi]
-        scales = np.exp(gaussians.log_scales[part]).astype(np.float64)
-        axes = quats_to_matrices(gaussians.quats[part].astype(np.float64))[:, :, : scales.shape[1]]
-        points = (
-            np.einsum("mik,mk,sk->msi", axes, scales, normal[:, : scales.shape[1]]) + gaussians.means[part][:, None]
-        )
-        inside[lo:hi] = in_region(region, points.reshape(-1, 3)).reshape(len(part), samples).mean(1)
-
-    run_ranges(work, len(rows), chunk=1024)
-    return inside
 
 
 def _reaches(gaussians: Gaussians, region: Region) -> np.ndarray:

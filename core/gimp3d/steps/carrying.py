@@ -29,7 +29,7 @@ def seed_surface(completed: Completed, surfels: bool, settings: RemovalSettings)
 
 
 def map_reference(completed: Completed, views: Sequence[ViewState], settings: RemovalSettings) -> MappingField:
-    """Where each pixel of the reference's hole has its like, in what the views show."""
+    """Where each pixel of the reference's hole has its like, in what the views show: the paper's sampling asks."""
     c = completed
     seen = [(v.camera, v.left.depth_before, v.left.silhouette) for v in views]
     visibility = source_visibility(c.camera, c.depth, seen)
@@ -40,19 +40,17 @@ def map_reference(completed: Completed, views: Sequence[ViewState], settings: Re
         visibility,
         settings.mapping,
         settings.random_seed,
-        c.camera,
-        c.depth,
     )
 
 
-def as_reference(completed: Completed, field: MappingField) -> Reference:
+def as_reference(completed: Completed) -> Reference:
     c = completed
-    return Reference(c.camera, c.appearance.image, c.depth, c.target, c.source, field.rows, field.cols)
+    return Reference(c.camera, c.appearance.image, c.depth, c.target, c.source)
 
 
 def paint_views(
     completed: Completed,
-    field: MappingField,
+    field: MappingField | None,
     views: Sequence[ViewState],
     with_seeds: Gaussians,  # the scene without the object, the seeds in it
     settings: RemovalSettings,
@@ -66,7 +64,8 @@ def paint_views(
         return _as_drawn(view, with_seeds)
 
     loaders = [partial(load, v) for v in views]
-    return propagate(as_reference(completed, field), loaders, settings.propagate, progress)
+    sources = None if field is None else (field.rows, field.cols)
+    return propagate(as_reference(completed), loaders, settings.propagate, progress, sources)
 
 
 def with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView:

@@ -12,7 +12,7 @@ import scipy.ndimage
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..geometry import SOLID, disparity_of, sees
+from ..geometry import disparity_of, sees
 from ..presets import RemovalSettings
 from ..priors.appearance import Appearance
 from ..priors.calls import Call
@@ -179,7 +179,7 @@ def complete_view_depth(
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     depth_settings = replace(settings.depth, surface=surface)
     others = [v.left for v in views]
-    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks, SOLID), prior, depth_settings)
+    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks), prior, depth_settings)
 
 
 def paint_view(
@@ -198,7 +198,7 @@ def paint_view(
     if settings.use_evidence:
         # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
         sources = ((v.camera, v.bare, np.where(v.left.silhouette, 0, v.left.depth_before)) for v in views)
-        evidence = gather_evidence(masks.camera, depth, masks.target, sources, settings.evidence)
+        evidence = gather_evidence(masks.camera, depth, masks.target, sources)
         seen = evidence.seen
         base = np.where(seen[..., None], evidence.image, base)
     filled = inpaint_reference(

@@ -28,7 +28,7 @@ def test_the_hole_is_nearly_as_right_as_the_splats_round_it(shared_data: Path, n
     views = find_masks(gaussians, region, [*(c for c in cameras if c.split == "train"), camera]).views
     view = next(v for v in views if v.camera.id == camera.id)
     truth = np.load(folder / "truth" / "test" / "000.depth.npy").astype(np.float64)
-    known = rim(view, 0.9)
+    known = rim(view)
     found = complete_depth(view, views, disparity_of(view.depth_after), known)
     ring = known & (distance_to(view.target) <= 24)
     own = 100 * np.median(np.abs(view.depth_after[ring] / truth[ring] - 1))

@@ -159,52 +159,6 @@ def test_the_seed_of_the_run_and_of_the_settings_both_count() -> None:
     assert (by_run.rows == by_settings.rows).all() and (by_run.cost == by_settings.cost).all()
 
 
-def corridor() -> tuple[Camera, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A wall over a floor of one texture: (camera, picture, depth, target on the floor, what is floor)."""
-    view = Camera("corridor", 128, 96, 110.0, 110.0, 64, 40, np.eye(4))
-    directions = view.unproject(view.pixel_centres(), np.ones((96, 128)))
-    with np.errstate(divide="ignore"):
-        down = np.where(directions[..., 1] > 0, 1.0 / directions[..., 1], np.inf)
-    depth = np.minimum(down, 3.0)
-    noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(96, 128, 3)), (0, 0), 1.5)
-    picture = np.clip(128 + 250 * noise, 0, 255).astype(np.uint8)
-    target = np.zeros(depth.shape, bool)
-    target[86:94, 50:78] = True
-    picture[86:94, 50:78] = picture[20:28, 50:78]  # looks like a piece of the wall
-    return view, picture, depth.astype(np.float32), target, down < 3
-
-
-def test_geometry_keeps_sources_on_the_targets_surface() -> None:
-    view, picture, depth, target, floor = corridor()
-    seen = np.ones(target.shape, np.float32)
-    flat = mapping_field(picture, target, ~target, seen, MappingSettings(geometry=False), 0, view, depth)
-    field = mapping_field(picture, target, ~target, seen, MappingSettings(), 0, view, depth)
-    on_floor = [floor[f.rows[target], f.cols[target]].mean() for f in (flat, field)]
-    assert on_floor[0] < 0.5 < 0.95 < on_floor[1]
-    ratio = depth[field.rows[target], field.cols[target]] / depth[target]
-    assert (ratio < 2.05).all() and (ratio > 1 / 2.05).all()
-
-
-def test_geometry_does_not_depend_on_the_thread_count() -> None:
-    view, picture, depth, target, _ = corridor()
-    fields = []
-    for threads in (1, 2, 4):
-        set_thread_count(threads)
-        fields.append(mapping_field(picture, target, ~target, np.ones(target.shape, np.float32), seed=3,
-                                    camera=view, depth=depth))  # fmt: skip
-    for other in fields[1:]:
-        assert (fields[0].rows == other.rows).all() and (fields[0].cost == other.cost).all()
-
-
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
-def test_without_depth_the_field_is_the_pictures(value: float) -> None:
-    picture, target, visibility = twins()
-    depth = np.full(target.shape, value, np.float32)
-    field = mapping_field(picture, target, ~target, visibility, camera=camera(width=128, height=64), depth=depth)
-    rows, cols = np.nonzero(target)
-    assert ((field.rows[target] == rows) & (field.cols[target] == cols + 42)).mean() > 0.95
-
-
 def test_as_printed_sources_are_off_by_the_place_that_they_are_for() -> None:
     rng = np.random.default_rng(2)
     image = rng.integers(0, 256, (60, 80, 3), np.uint8)
@@ -212,8 +166,7 @@ def test_as_printed_sources_are_off_by_the_place_that_they_are_for() -> None:
     target[20:30, 20:36] = True
     nowhere = np.zeros(target.shape, np.float32)
     plain, printed = (
-        mapping_field(image, target, ~target, nowhere, MappingSettings(geometry=False, as_printed=p))
-        for p in (False, True)
+        mapping_field(image, target, ~target, nowhere, MappingSettings(as_printed=p)) for p in (False, True)
     )
     rows, cols = np.indices(target.shape)
     legal = target & (plain.rows + rows < 60) & (plain.cols + cols < 80)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scenes import REGION, cameras, scene
@@ -12,7 +10,7 @@ from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
 from gimp3d.orbit import look_at
 from gimp3d.stages.masks import find_masks
-from gimp3d.stages.reference import ReferenceSettings, _coarse, choose_reference, needed_surface
+from gimp3d.stages.reference import _coarse, choose_reference, needed_surface
 
 UP = np.array([0, 0, 1.0])
 
@@ -36,21 +34,6 @@ def test_the_steep_view_wins_over_the_grazing_one_and_the_cut_off_one() -> None:
     assert all(0 < s.score <= 1 and 0 < s.detail <= 1 for s in choice.scores)
 
 
-def test_what_one_view_does_not_show_is_planned_for_the_next() -> None:
-    masks = find_masks(scene(), REGION, cameras())
-    left, right = (np.arange(120) < 60)[None], (np.arange(120) >= 60)[None]
-    first = masks.views[0]
-    views = [
-        replace(first, camera=replace(first.camera, id=name), target=first.target & part)
-        for name, part in (("left", left), ("right", right))
-    ]
-    choice = choose_reference([*views, replace(first, camera=replace(first.camera, id="none"), target=left & right)])
-    assert {name for name, _ in choice.plan} == {"left", "right"}
-    shares = [share for _, share in choice.plan]
-    assert 0.2 < shares[0] < 0.8 and shares[1] == 1.0
-    assert choice.plan[1][0] in choice.reason
-
-
 def test_the_needed_surface_is_the_floor_under_the_object() -> None:
     surface = needed_surface(find_masks(scene(), REGION, cameras()).views)
     assert len(surface.points) > 100
@@ -71,7 +54,7 @@ def test_a_coarse_view_shows_the_same_points(step: int) -> None:
 
 def test_large_holes_are_sampled_as_well_as_small_ones() -> None:
     views = find_masks(scene(), REGION, cameras()).views
-    fine, coarse = (needed_surface(views, settings=ReferenceSettings(samples=n)) for n in (10**6, 50))
+    fine, coarse = (needed_surface(views, samples=n) for n in (10**6, 50))
     assert 0 < len(coarse.points) < 0.5 * len(fine.points)
     apart = np.linalg.norm(fine.points[:, None] - coarse.points[None], axis=-1)
     assert apart.min(1).max() < 0.15 and apart.min(0).max() < 0.1  # one surface, and all of it

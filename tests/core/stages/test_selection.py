@@ -6,18 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from property_tests import examples
 from scenes import BLOCK, block, cameras, discs, floor, scene, truth
-from scipy.special import ndtr
 
 from gimp3d.box import Box, Region
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render, surface_depth
 from gimp3d.stages.masks import Masks, MaskSettings, find_masks
-from gimp3d.stages.selection import Fate, SelectionSettings, mass_inside, select_removed, standing
+from gimp3d.stages.selection import Fate, SelectionSettings, select_removed, standing
 
 DEEP = (Box.make([0, 0, 0.2], [0.9, 0.9, 0.72]),)  # cuts 16 cm into the floor, a hand's width round the block
 VIEWS = cameras(12, 200, 150)
@@ -36,35 +32,6 @@ def found(gaussians: Gaussians, region: Region = DEEP, clean: Gaussians | None =
     """Masks with photos of the clean scene, by default of the scene itself."""
     photos = {c.id: render_bytes(gaussians if clean is None else clean, c) for c in VIEWS}
     return find_masks(gaussians, region, VIEWS, MaskSettings(selection=SelectionSettings(**changed)), photos=photos)
-
-
-@examples(40)
-@given(seed=st.integers(0, 10_000))
-def test_mass_is_the_integral_over_the_box(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    g = discs(rng.normal(size=(20, 3)), (0, 0, 1), np.full((20, 3), 0.5), 1.0)
-    g.log_scales[:] = rng.uniform(-3, 1, (20, 3))
-    turn = rng.normal(size=4)
-    g.quats[:] = turn
-    box = Box.make(
-        rng.normal(size=3), rng.uniform(0.3, 3, 3), turn
-    )  # aligned with them: per axis, by the error function
-    low, high = (((g.means - box.center) @ box.axes * -1 + s * box.size / 2) / g.scales for s in (-1, 1))
-    exact = (ndtr(high) - ndtr(low)).prod(1)
-    assert np.abs(mass_inside(g, np.arange(20), (box,)) - exact).max() < 0.06
-    assert np.abs(mass_inside(g, np.arange(20), (box,), 4096) - exact).max() < 0.012
-
-
-def test_mass_in_overlapping_boxes_counts_once_and_surfels_are_flat() -> None:
-    g = discs(np.zeros((1, 3)), (0, 0, 1), np.full((1, 3), 0.5), 1.0)
-    box = Box.make([0, 0, 0], [2, 2, 2])
-    rows = np.array([0])
-    one = mass_inside(g, rows, (box,))
-    assert mass_inside(g, rows, (box, box)) == one
-    surfel = replace(g, log_scales=np.zeros((1, 2), np.float32))
-    flat = mass_inside(surfel, rows, (Box.make([0, 0, 0], [2, 2, 1e-3]),), 4096)
-    assert abs(flat[0] - (ndtr(1) - ndtr(-1)) ** 2) < 0.01
-    assert mass_inside(g, np.array([], int), (box,)).shape == (0,)
 
 
 def test_floor_in_the_box_stays_and_the_object_goes() -> None:
@@ -113,7 +80,7 @@ def test_a_giant_of_the_background_stays_and_opens_no_hole() -> None:
     rim = rim.take((np.abs(rim.means[:, :2]) > 1.4).any(1))  # so that the giant is all there is near the block
     whole = rim.extended(block()).extended(ground)
     masks = found(whole)
-    assert masks.selection.fates[-1] == Fate.KEPT_LARGE and masks.selection.counts["kept_large"] == 1
+    assert masks.selection.fates[-1] == Fate.KEPT_SURFACE and masks.selection.counts["kept_surface"] == 1
     for view in masks.views[::4]:
         before = render(whole, view.camera).alpha
         assert (view.alpha_after[~view.polygon] > before[~view.polygon] - 0.05).all()

@@ -184,8 +184,7 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
     view = plain.targets.views[0]
     filled = plain.scene.take(plain.keep).extended(patch)
     depth = surface_depth(filled, view.camera)[0]
-    none = np.full(depth.shape, -1, np.int32)
-    picture = Reference(view.camera, render_bytes(filled, view.camera), depth, view.target, ~view.target, none, none)
+    picture = Reference(view.camera, render_bytes(filled, view.camera), depth, view.target, ~view.target)
     told = plain.judged(patch, given=picture)
     assert told.invented < 0.3 * good.invented and told.score > good.score
     other = replace(picture, image=cv2.bitwise_not(picture.image))

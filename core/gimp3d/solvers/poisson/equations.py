@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -23,13 +23,11 @@ LEAST_WEIGHT, MOST_WEIGHT = 1e-30, 1e30  # what float32 can hold
 
 @dataclass(frozen=True)
 class PoissonSettings:
-    """When to stop, and how precise the result is."""
+    """When to stop."""
 
     # Residual over that of the guidance plus one constant per component, each equation divided by its diagonal
     tolerance: float = 1e-5
     most_iterations: int = 150  # then a direct solve: only mazes of one-pixel walls get there (5 are usual)
-    # Of the result. float32 saves a quarter of the memory; its residual ends near 2e-6 of the first one.
-    precision: Literal["float32", "float64"] = "float64"
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def solve_poisson(
     """
     hole = np.asarray(hole, bool)
     solution = solve_hole(hole, known, values, guidance, settings, weight=weight, anchor=anchor)
-    filled, unanchored = np.array(values, dtype=settings.precision), np.zeros(hole.shape, bool)
+    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
     filled[hole], unanchored[hole] = solution.values, solution.unanchored
     return PoissonSolution(filled, solution.iterations, unanchored)
 
@@ -145,7 +143,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     kind[1 : h + 1, 1 : w + 1][task.hole] = HOLE
     runs, parts, rim = _find_runs(kind)
     count, channels = int((runs[:, 2] - runs[:, 1]).sum()), task.values.shape[2]
-    result = np.zeros((count, channels), settings.precision)
+    result = np.zeros((count, channels))
     if not count:
         return HoleSolution(result, 0, np.zeros(0, bool))
 
@@ -171,7 +169,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     amounts = ties.amounts - ties.strengths[:, None] * shift[part]
 
     places = places_of(runs[run, 0], ties.unknowns - runs[run, 3] + runs[run, 1], kind.shape)
-    grids, solve_directly, most = Multigrid(kind, runs, places, ties.strengths, settings.precision), None, 0
+    grids, solve_directly, most = Multigrid(kind, runs, places, ties.strengths), None, 0
     for c in range(channels):
         # A power of two, so that nothing is rounded: float32 must not underflow
         scale = 2.0 ** np.frexp(np.abs(amounts[:, c] * grids.inverse.reshape(-1)[places]).max())[1]

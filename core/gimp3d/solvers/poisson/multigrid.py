@@ -20,8 +20,8 @@ counterpart. Operators may then be singular, which does no harm: right-hand side
 the null space has no effect on the finest grid. The smoother is one Jacobi step; W-cycles, where grids are large, make
 up for what it leaves near irregular rims: without them iterations grow with the hole.
 
-**Two precisions.** Iterations are in float32. What they find is gathered, and the residual found anew, in the
-precision asked for (van der Vorst and Ye 2000): the result is as accurate as if all was done in that.
+**Two precisions.** Iterations are in float32. What they find is gathered, and the residual found anew, in
+float64 (van der Vorst and Ye 2000): the result is as accurate as if all was done in that.
 
 Only the stretches of rows that hold unknowns ("spans") are visited. Everything outside the hole is zero at all times,
 which is why kernels need no tests. They are serial: views run in parallel.
@@ -101,18 +101,13 @@ class Multigrid:
         runs: np.ndarray,  # [R, ≥ 3] int64: row, first and end column of each run of pixels in the hole
         places: np.ndarray,  # [T] int64, see places_of
         strengths: np.ndarray,  # [T], by how much D there is above the number of neighbours in the hole
-        precision: str,  # float32 or float64, of the result
     ) -> None:
         rows, columns = inside.shape
         stride = row_stride(columns // 2 + 1)
-        kind = np.dtype(precision).type
-        self.inverse, self.right, self.u = np.zeros((3, 2, rows * stride), kind)
-        if kind is np.float32:
-            inverse = self.inverse
-        else:
-            inverse = np.zeros(self.inverse.shape, np.float32)
+        self.inverse, self.right, self.u = np.zeros((3, 2, rows * stride))
+        inverse = np.zeros(self.inverse.shape, np.float32)
         diagonal, *fine_vectors = np.zeros((6, rows * stride), np.float32)
-        np.add.at(self.inverse.reshape(-1), places, strengths.astype(kind))
+        np.add.at(self.inverse.reshape(-1), places, strengths)
         first, spans = _find_spans(runs, rows, stride)
         flags = np.zeros(inside.shape, np.uint8)
         _fill(inside, first, spans, stride, self.inverse, inverse, diagonal, flags)

@@ -19,10 +19,10 @@ from ...geometry import EVIDENCE_DEPTH, bounds, cropped
 from ...progress import Progress, silent
 from ...solvers.colours import NO_CHANGE
 from .blend import blend_band, to_bytes
-from .paper import Lent, Mapped, blend_rim, lent_colours, sampled
+from .paper import Lent, Mapped, Sources, blend_rim, lent_colours, sampled
 from .transfer import flat, learned_change
 from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
-from .warp import picture_of, warp_reference
+from .warp import Picture, picture_of, warp_reference
 
 __all__ = [
     "Loader",
@@ -59,8 +59,12 @@ def propagate(
     views: Sequence[Loader],
     settings: PropagateSettings = PropagateSettings(),
     progress: Progress = silent,
+    sources: Sources | None = None,
 ) -> Propagation:
     """Paint the hole of every view. Painted views are never sources for others: order is irrelevant.
+
+    `sources` is the mapping field, rows and columns [H, W] int32 of each of the reference's target pixels' source, -1 =
+    none: only the paper's sampling asks for it.
 
     As many views are in memory as threads work on them; what is kept of each is the part round its hole.
 
@@ -72,14 +76,15 @@ def propagate(
     for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
         if value not in known:
             raise BadInput(f"propagate: unknown {name} {value!r}; use {', '.join(known)}")
-    mapped = Mapped.of(reference, settings.transfer != "none")
-    lent = lent_colours(mapped, views, settings) if settings.transfer == "sample" else ()
+    mapped = Mapped.of(reference, sources) if sources is not None and settings.transfer == "sample" else None
+    lent = lent_colours(mapped, views, settings) if mapped else ()
+    picture = picture_of(reference)
     done = 0
 
     def paint(load: Loader) -> PaintedView:
         nonlocal done
         view = load()
-        painted = _painted(mapped, view, lent, settings)
+        painted = _painted(reference, picture, view, mapped, lent, settings)
         done += 1
         progress("propagate", done, len(views), view.camera.id)
         return painted
@@ -91,12 +96,19 @@ def propagate(
     return Propagation(painted, float(1 - counts[Rule.UNREACHED] / total), shares)
 
 
-def _painted(mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], settings: PropagateSettings) -> PaintedView:
+def _painted(
+    reference: Reference,
+    picture: Picture,  # the reference's
+    view: ViewToPaint,
+    mapped: Mapped | None,
+    lent: Sequence[Lent],
+    settings: PropagateSettings,
+) -> PaintedView:
     """One view: what of it is photo of the new surface, the rest warped, changed and blended."""
     if not view.target.any():
         nothing = np.zeros((0, 0, 3), np.uint8)
         return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
-    reference, reach = mapped.reference, _reach(view.target)
+    reach = _reach(view.target)
     near, top, left = _cropped(view, reach)
     same = _same_surface(near)
     evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
@@ -105,14 +117,14 @@ def _painted(mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], settings: 
     distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     photo = ~near.silhouette & same & ~hole & (distance <= reach)
     depth = np.ascontiguousarray(near.depth_new, np.float32)
-    warp = warp_reference(mapped.picture, near.camera, depth, hole | photo)
+    warp = warp_reference(picture, near.camera, depth, hole | photo)
     painted, photo = hole & warp.reached, photo & warp.reached
     photo[photo] = warp.lookup(reference.source | reference.target, photo)
-    sources = mapped.sources_in(picture_of(view), settings.retarget)
-    rules = mapped.rules(sources, warp, hole)
+    rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
+    rules[painted] = Rule.OWN_PIXELS if settings.transfer == "learned" else Rule.REFERENCE
     raw, change = warp.colours, NO_CHANGE
-    if settings.transfer == "sample":
-        raw, rules = sampled(mapped, view, sources, lent, warp, rules)
+    if mapped is not None:
+        raw, rules = sampled(mapped, view, lent, warp, rules, settings.retarget)
     elif settings.transfer == "learned":
         alike = photo & flat(depth)
         alike[alike] = warp.lookup(reference.source, alike)

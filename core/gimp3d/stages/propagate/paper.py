@@ -1,8 +1,7 @@
 """The paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
 
 Where the view does not show that source, another one near it that looks alike is taken (retargeting), else another
-view's pixel. Which sources a view shows, `Mapped.sources_in`, tells the default transfer which pixels are the view's
-own as well; the sampling and the blend to the rim are the paper's alone (`transfer="sample"`, `blend="rim"`).
+view's pixel (`transfer="sample"`); what is painted is blended to its rim (`blend="rim"`).
 """
 
 from __future__ import annotations
@@ -29,8 +28,11 @@ ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source
 OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
 
 
+Sources = tuple[np.ndarray, np.ndarray]  # see propagate
+
+
 @dataclass(frozen=True)
-class Sources:
+class Shown:
     """Where a view shows the patches that explain the mapped pixels."""
 
     rows: np.ndarray  # [M] int32 in the reference: the field's, or found near it
@@ -51,16 +53,15 @@ class Mapped:
     index: np.ndarray  # [H, W] int32, each pixel's place in the list; -1 = none
 
     @classmethod
-    def of(cls, reference: Reference, mapped: bool) -> Mapped:
-        """The reference's field, or none of it."""
-        there = reference.target & (reference.rows >= 0) & mapped
+    def of(cls, reference: Reference, sources: Sources) -> Mapped:
+        there = reference.target & (sources[0] >= 0)
         rows, cols = (x.astype(np.int32) for x in np.nonzero(there))
         index = np.full(there.shape, -1, np.int32)
         index[rows, cols] = np.arange(len(rows))
-        to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in (reference.rows, reference.cols))
+        to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in sources)
         return cls(reference, picture_of(reference), rows, cols, to_rows, to_cols, index)
 
-    def sources_in(self, view: Picture, reach: int) -> Sources:
+    def shown_in(self, view: Picture, reach: int) -> Shown:
         """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not.
 
         Patches are compared in the reference, where one camera sees both; the view only says which of them it shows.
@@ -70,16 +71,7 @@ class Mapped:
         worst = 3 * ALIKE**2
         places, found = (self.rows, self.cols), (rows, cols, rules)
         run_ranges(_find_range, len(rows), *places, self.picture, view, SAME_DEPTH, RADIUS, reach, worst, *found)
-        return Sources(rows, cols, rules)
-
-    def rules(self, sources: Sources, warp: Warp, hole: np.ndarray) -> np.ndarray:
-        """[h, w] uint8: the rule of each pixel of the hole by the source of the reference pixel that it shows."""
-        rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
-        reached = hole & warp.reached
-        listed = warp.lookup(self.index, reached)
-        found = np.append(sources.rules, 0)[listed]  # -1, which is not in the list, is the last
-        rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
-        return rules
+        return Shown(rows, cols, rules)
 
 
 @dataclass(frozen=True)
@@ -102,14 +94,18 @@ def lent_colours(mapped: Mapped, views: Sequence[Loader], settings: PropagateSet
 def sampled(
     mapped: Mapped,
     view: ViewToPaint,
-    sources: Sources,
     lent: Sequence[Lent],
     warp: Warp,
-    rules: np.ndarray,  # [h, w] uint8, see Mapped.rules
+    rules: np.ndarray,  # [h, w] uint8, REFERENCE where the warp reaches the hole
+    retarget: int,  # px
 ) -> tuple[np.ndarray, np.ndarray]:
     """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole."""
+    sources = mapped.shown_in(picture_of(view), retarget)
+    reached = rules == Rule.REFERENCE
+    found = np.append(sources.rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
     raw, rules = warp.colours.copy(), rules.copy()
-    rows, cols = np.nonzero(warp.reached & (rules > 0))
+    rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
+    rows, cols = np.nonzero(reached)
     places = rows, cols, warp.u, warp.v
     taken = mapped.index, sources.rows, sources.cols, sources.rules, *_borrowed(mapped, view, sources, lent)
     pictures = mapped.picture, picture_of(view)
@@ -117,9 +113,7 @@ def sampled(
     return raw, rules
 
 
-def _borrowed(
-    mapped: Mapped, view: ViewToPaint, sources: Sources, lent: Sequence[Lent]
-) -> tuple[np.ndarray, np.ndarray]:
+def _borrowed(mapped: Mapped, view: ViewToPaint, sources: Shown, lent: Sequence[Lent]) -> tuple[np.ndarray, np.ndarray]:
     """[M, 3] colours of the sources by the nearest view that shows them, at this view's exposure; [M] bool: there."""
     colours, has = np.zeros((len(sources.rows), 3), np.float32), np.zeros(len(sources.rows), bool)
     others = sorted(
@@ -135,7 +129,7 @@ def _borrowed(
 
 
 def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
-    seen = mapped.sources_in(picture_of(view), reach=0).rules > 0
+    seen = mapped.shown_in(picture_of(view), reach=0).rules > 0
     reference, camera = mapped.reference, view.camera
     rows, cols = mapped.source_rows[seen], mapped.source_cols[seen]
     points = reference.camera.unproject(

@@ -17,8 +17,8 @@ class Rule(IntEnum):
 
     UNTOUCHED = 0
     EVIDENCE = 1  # the photo shows the new surface itself here: T reaches beyond the object
-    OWN_PIXELS = 2  # by the view's own pixels at the mapped source
-    REFERENCE = 3  # the warped reference colour: no source to be seen
+    OWN_PIXELS = 2  # by the view's own: what they say of the reference's colours, or (paper) those at the mapped source
+    REFERENCE = 3  # the warped reference colour alone
     UNREACHED = 4  # the reference does not see this surface
     RETARGETED = 5  # by the view's own pixels near the mapped source, which is itself hidden or off-screen
     OTHER_VIEW = 6  # the mapped source as another view shows it
@@ -34,7 +34,7 @@ class PropagateSettings:
     transfer: Literal["learned", "sample", "none"] = "learned"  # way; the reference's texture against the view's light
     # band: fitted to the photo round the hole; rim: to the rim's pixels alone (paper)
     blend: Literal["band", "rim"] = "band"  # way; an even level against no seam at any pixel of the rim
-    retarget: int = 32  # px searched round a source that is hidden or off-screen; time against more own pixels
+    retarget: int = 32  # px searched round a source that is not to be seen (sample only); time against more own pixels
     donors: int = 8  # views that lend samples of sources a view does not show (sample only); time against holes
 
 
@@ -47,8 +47,6 @@ class Reference:
     depth: np.ndarray  # [H, W] float32, completed
     target: np.ndarray  # [H, W] bool, T_0
     source: np.ndarray  # [H, W] bool, pixels that show a photo's unhidden surface
-    rows: np.ndarray  # [H, W] int32, source of each target pixel, -1 = none
-    cols: np.ndarray
 
 
 @dataclass(frozen=True)
