@@ -1,8 +1,8 @@
 """Throws changed files at every reader, for as long as it is let; goes on where it stopped. Run by `make fuzz`.
 
-With atheris, libFuzzer's engine for Python, changes are guided by the lines they reach, and what reaches new ones is
-kept in OUT/corpus; without it, cases are made by their numbers alone. Either way OUT/counts.json holds how many cases
-each reader has had, until readers of texts and numbers have had --in-memory and those of files --in-files.
+With atheris, libFuzzer's engine for Python, half of the cases start from what reached new lines, which is kept in
+OUT/corpus; the others, and all without atheris, start from files that a reader takes. OUT/counts.json holds how many
+cases each reader has had, until readers of texts and numbers have had --in-memory and those of files --in-files.
 
     python tools/fuzz.py [--out build/fuzz] [--in-memory 1000000] [--in-files 100000] [--seconds S] [--only NAME]
 
@@ -15,9 +15,11 @@ import argparse
 import hashlib
 import importlib.util
 import json
+import os
 import random
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -29,13 +31,17 @@ GUIDED = importlib.util.find_spec("atheris") is not None
 if GUIDED:
     import atheris
 
-    NOT_READERS = ("stages", "solvers", "raster", "priors", "evaluate", "pipeline", "report", "commands", "cli")
-    with atheris.instrument_imports(include=["gimp3d"], exclude=[f"gimp3d.{name}" for name in NOT_READERS]):
+    READ_HERE = ("io", "schema", "job", "store", "box", "camera", "files", "settings",
+                 "priors.onnx", "priors.servers", "priors.monodepth")  # fmt: skip
+    ALL = (p.relative_to(ROOT / "core").with_suffix("").parts for p in (ROOT / "core" / "gimp3d").rglob("*.py"))
+    OTHERS = [n for n in map(".".join, ALL) if not n.removeprefix("gimp3d.").startswith(READ_HERE)]
+    with atheris.instrument_imports(include=["gimp3d"], exclude=[n.removesuffix(".__init__") for n in OTHERS]):
         from readers import READERS, Reader, case, mutated
 else:
     from readers import READERS, Reader, case, mutated
 
-AT_ONCE = {False: 100_000, True: 5_000}  # cases between two looks at the clock, of readers in memory and of files
+AT_ONCE = {False: 500_000, True: 100_000}  # cases of a process, whose start takes 2 s: of readers in memory, of files
+LONGEST = 2  # times the largest seed: what grows without end gets slow
 SLOWEST, LARGEST = 20, 4096  # seconds and MiB that a case may take
 
 
@@ -50,6 +56,13 @@ def main() -> int:
     given = parser.parse_args()
     if given.chunk:
         return run_chunk(READERS[given.only], given.out, given.chunk)
+    # atheris ends a process without letting it clean up
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as place:
+        return run_all(given, {**os.environ, "TMPDIR": place})
+
+
+def run_all(given: argparse.Namespace, environment: dict[str, str]) -> int:
+    """All readers in turn, each in processes of its own, until they have had their cases or the time is over."""
     end, failed = time.monotonic() + given.seconds, False
     names = [given.only] if given.only else list(READERS)
     while names and time.monotonic() < end:
@@ -62,7 +75,7 @@ def main() -> int:
             size = min(AT_ONCE[READERS[name].needs_files], most - done["cases"])
             start = time.monotonic()
             command = [sys.executable, __file__, "--out", str(given.out), "--only", name, "--chunk", str(size)]
-            ran = subprocess.run(command, capture_output=True, text=True, errors="replace")
+            ran = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace")
             if ran.returncode:
                 print(f"{name}: found something\n{ran.stdout[-2000:]}{ran.stderr[-1000:]}", flush=True)
                 names.remove(name)
@@ -103,11 +116,13 @@ def run_chunk(reader: Reader, out: Path, size: int) -> int:
 
     def changed(data: bytes, most: int, seed: int) -> bytes:
         rng = random.Random(seed)
+        start = data if data and rng.random() < 0.5 else rng.choice(seeds)
         if rng.random() < 0.3:
-            return atheris.Mutate(data, most)
-        return mutated(data or rng.choice(seeds), rng, reader.is_json)[:most]
+            return atheris.Mutate(start, most)
+        return mutated(start, rng, reader.is_json)[:most]
 
-    words = f"-runs={size} -seed={done + 1} -timeout={SLOWEST} -rss_limit_mb={LARGEST} -max_len=65536"
+    words = f"-runs={size} -seed={done + 1} -timeout={SLOWEST} -rss_limit_mb={LARGEST}"
+    words += f" -max_len={LONGEST * max(map(len, seeds))}"
     options = [sys.argv[0], *words.split(), f"-artifact_prefix={found}/{reader.name}-", str(corpus)]
     atheris.Setup(options, lambda data: reader.check(data) and None, custom_mutator=changed)
     atheris.Fuzz()  # ends the process

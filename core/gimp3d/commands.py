@@ -233,10 +233,10 @@ def write_masks(
         views = {v.id: v for v in behind.views}
         charts, lit = charts_to_paint(behind.charts, behind.views), behind.lit
     if pictures:
-        write_json(pictures / "proposed.json", _proposed(found.proposed, frame))
+        write_json(pictures / "proposed.json", frame.proposed_back(found.proposed))
         write_json(pictures / "light.json", {"shadow": lit.shadow, "reflection": lit.reflection})
         if all(c.split == "train" for c in written):
-            write_charts(pictures / "charts", _charts_back(charts, frame))
+            write_charts(pictures / "charts", frame.charts_back(charts))
     for camera in written:
         view = views.get(camera.id)
         name = output_name(camera.id)
@@ -348,7 +348,7 @@ def run_removal(
             shadow,
             allow_network,
         )
-        charts, proposed = _charts_back(result.charts, frame), _proposed(result.proposed, frame)
+        charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
         results.append(replace(result, charts=charts, proposed=proposed))
     summary = summary_of(job, settings, file, results[0], warnings, time.perf_counter() - start)
     summary["variants"] = [variant_facts(path, result) for path, result in zip(job.outs(), results)]
@@ -381,7 +381,8 @@ def _try_targets(job: RemovalJob, folder: Path | None) -> None:
     """Sweep what killed runs left half-written, and see that everything can be written before the work starts."""
     files = [*job.outs(), *(Path(p) for p in (job.summary, folder and folder / "summary.json") if p)]
     folders = [Path(p) for p in (job.report, job.views_out, folder and folder / "stages") if p]
-    sweep([*(f.parent for f in files), *folders])
+    of_variants = folder.glob("stages/*/") if folder else ()
+    sweep([*(f.parent for f in files), *folders, *of_variants])
     for path in files:
         try_target(path)
     for path in folders:
@@ -424,16 +425,6 @@ def _load_views(
 
     loaded = parallel_map(load, cameras)
     return [v for v, _ in loaded], sum(missing for _, missing in loaded)
-
-
-def _proposed(proposed: dict[str, Any], frame: Frame) -> dict[str, Any]:
-    return {**proposed, "box": frame.box_back(proposed["box"])} if proposed else proposed
-
-
-def _charts_back(charts: Sequence[Chart], frame: Frame) -> tuple[Chart, ...]:
-    """Charts whose cameras are in the file's frame."""
-    back = frame.cameras_back([c.camera for c in charts])
-    return tuple(replace(chart, camera=camera) for chart, camera in zip(charts, back))
 
 
 def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from .box import Box, Region
 from .camera import Camera
 from .gaussians import Gaussians
 from .io.ply import SplatFile, positions
+
+if TYPE_CHECKING:
+    from .stages.charts import Chart
 
 ORDINARY = (0.5, 128.0)  # scene units: usual depths in views at which a scene keeps its units …
 USUAL = 4.0  # … and what they are in a frame of its own
@@ -34,13 +38,14 @@ class Frame:
         """True where nothing is changed."""
         return self.scale == 1 and not self.origin.any()
 
-    def scene(self, file: SplatFile) -> Gaussians:
-        """The file's Gaussians; of double properties, the frame keeps the digits."""
+    def scene(self, scene: SplatFile | Gaussians) -> Gaussians:
+        """The Gaussians in this frame, in single precision; of means in double precision it keeps the digits."""
+        gaussians, points = _of(scene)
         if self.is_files:
-            return file.gaussians
+            return replace(gaussians, means=gaussians.means.astype(np.float32, copy=False))
         with np.errstate(over="ignore", invalid="ignore"):
-            means = ((positions(file) - self.origin) * self.scale).astype(np.float32)
-        return replace(file.gaussians, means=means, log_scales=self._sizes(file.gaussians, self.scale))
+            means = ((points - self.origin) * self.scale).astype(np.float32)
+        return replace(gaussians, means=means, log_scales=self._sizes(gaussians, self.scale))
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the file's frame in this one."""
@@ -60,6 +65,14 @@ class Frame:
             return gaussians
         means = gaussians.means.astype(np.float64) / self.scale + self.origin
         return replace(gaussians, means=means, log_scales=self._sizes(gaussians, 1 / self.scale))
+
+    def charts_back(self, charts: Sequence[Chart]) -> tuple[Chart, ...]:
+        """Charts whose cameras are in the file's frame."""
+        return tuple(replace(c, camera=b) for c, b in zip(charts, self.cameras_back([c.camera for c in charts])))
+
+    def proposed_back(self, proposed: dict[str, Any]) -> dict[str, Any]:
+        """What a removal proposes to take along, see Growth.facts."""
+        return {**proposed, "box": self.box_back(proposed["box"])} if proposed else proposed
 
     def box_back(self, box: dict[str, list[float]] | None) -> dict[str, list[float]] | None:
         """A box as JSON, see Box.to_json."""
@@ -83,7 +96,7 @@ class Frame:
 FILES = Frame(np.zeros(3), 1.0)
 
 
-def frame_of(file: SplatFile, cameras: Sequence[Camera]) -> Frame:
+def frame_of(scene: SplatFile | Gaussians, cameras: Sequence[Camera]) -> Frame:
     """The frame that suits a scene as these cameras see it: near the origin and of ordinary size.
 
     Most scenes are so already, and keep theirs.
@@ -94,8 +107,9 @@ def frame_of(file: SplatFile, cameras: Sequence[Camera]) -> Frame:
     >>> frame_of(file, cameras).scale
     1.0
     """
-    usable = np.flatnonzero(file.gaussians.usable)
-    points = positions(file)[usable[:: len(usable) // SAMPLED + 1]]
+    gaussians, points = _of(scene)
+    usable = np.flatnonzero(gaussians.usable)
+    points = points[usable[:: len(usable) // SAMPLED + 1]]
     depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]
     usual = float(np.nanmedian(depths)) if np.isfinite(depths).any() else np.nan
     if not np.isfinite(usual) or usual <= 0:
@@ -106,6 +120,13 @@ def frame_of(file: SplatFile, cameras: Sequence[Camera]) -> Frame:
         return Frame(np.zeros(3), scale)
     step = 2.0 ** round(np.log2(usual))  # so that single precision loses nothing by the difference
     return Frame(np.round(middle / step) * step, scale)
+
+
+def _of(scene: SplatFile | Gaussians) -> tuple[Gaussians, np.ndarray]:
+    """The Gaussians, and their means in all the digits that there are."""
+    if isinstance(scene, Gaussians):
+        return scene, scene.means.astype(np.float64)
+    return scene.gaussians, positions(scene)
 
 
 def _usual_depth(points: np.ndarray, camera: Camera) -> float:

@@ -12,6 +12,7 @@ from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .filling import Filling, ask_for_refinement, fill_hole, refine
+from .frame import frame_of
 from .gaussians import Gaussians
 from .presets import PRESETS, RemovalSettings
 from .priors.inpaint import check_provider, painter
@@ -66,7 +67,8 @@ def remove_object(
     Returns
     -------
     RemovalResult
-        `keep` [N] bool over the scene's rows, `added` new Gaussians (or None); and what each stage says of itself.
+        `keep` [N] bool over the scene's rows, `added` new Gaussians (or None; their means are float64 where the
+        scene's units or origin ask for it, see frame.py); and what each stage says of itself.
 
     Raises
     ------
@@ -83,9 +85,35 @@ def remove_object(
     >>> bool(result.keep.all()), len(result.added) > 0
     (False, True)
     """
-    run = Run(settings, progress, store, allow_network, observer)
-    for notice in provider_notices(settings, allow_network):
-        progress("read", 0, 1, notice)
+    frame = frame_of(scene, [v.camera for v in views])
+    result = _remove(
+        Run(settings, progress, store, allow_network, observer),
+        frame.scene(scene),
+        [replace(v, camera=frame.camera(v.camera)) for v in views],
+        frame.region(region),
+        reference,
+        reference_image,
+        extra_masks,
+        shadow_masks,
+    )
+    charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
+    return replace(result, added=frame.back(result.added), charts=charts, proposed=proposed)
+
+
+def _remove(
+    run: Run,
+    scene: Gaussians,
+    views: Sequence[View],
+    region: Region,
+    reference: str | None,
+    reference_image: np.ndarray | None,
+    extra_masks: Mapping[str, np.ndarray] | None,
+    shadow_masks: Mapping[str, np.ndarray] | None,
+) -> RemovalResult:
+    """The removal of a scene of ordinary size near the origin."""
+    settings = run.settings
+    for notice in provider_notices(settings, run.allow_network):
+        run.progress("read", 0, 1, notice)
     masks = _find_object(run, scene, views, region, extra_masks)
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")

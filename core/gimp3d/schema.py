@@ -92,7 +92,7 @@ def checked(
     BadInput
         If it is of another type or out of bounds.
     """
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    origin, arguments = _parts(kind)
     if kind is Any:
         return value
     if origin is Annotated:
@@ -149,6 +149,12 @@ def shown(value: Any) -> str:
         text = "a very long number"
     text = text.encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+@cache
+def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """What a type is made of; asked for every number of a file."""
+    return typing.get_origin(kind), typing.get_args(kind)
 
 
 def _number(kind: type, value: Any, where: str, bounds: Between) -> float | int:

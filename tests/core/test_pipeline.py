@@ -11,6 +11,7 @@ from scenes import REGION, cameras, scene
 
 from gimp3d.errors import BadInput
 from gimp3d.forecast import forecast_removal
+from gimp3d.frame import Frame
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 
@@ -81,6 +82,26 @@ def test_finished_stages_are_not_run_again() -> None:
     assert run_again == ["settle"]
     assert first.added is not None and second.added is not None
     np.testing.assert_array_equal(first.added.sh, second.added.sh)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(2.0**-14, 0.0), (2.0**20, 0.0), (2.0**-14, 2.0**30)])
+def test_a_library_call_takes_a_scene_in_any_units_and_anywhere(scale: float, shift: float) -> None:
+    """Not the command alone: a tiny scene lay nearer to its cameras than anything is drawn."""
+    elsewhere = Frame(shift * np.array([0.5, -0.3, 0.8]), scale)
+    means = (scene().means.astype(np.float64) - elsewhere.origin) * scale
+    moved = replace(scene(), means=means, log_scales=scene().log_scales + np.float32(np.log(scale)))
+    seen = [replace(v, camera=elsewhere.camera(v.camera)) for v in views()]
+    there = remove_object(moved, seen, elsewhere.region(REGION), PRESETS["draft"])
+    home = remove_object(scene(), views(), REGION, PRESETS["draft"])
+    np.testing.assert_array_equal(there.keep, home.keep)
+    assert there.added is not None and home.added is not None
+    back = elsewhere.back(there.added)
+    assert back is not None and len(back) == pytest.approx(len(home.added), rel=0.02)
+    for part in ("means", "log_scales"):
+        spread, expected = (np.percentile(getattr(g, part), [5, 50, 95], 0) for g in (back, home.added))
+        np.testing.assert_allclose(spread, expected, atol=0.02)
+    (chart,) = elsewhere.cameras_back([there.charts[0].camera])
+    np.testing.assert_allclose(chart.centre, home.charts[0].camera.centre, atol=1e-3)
 
 
 def test_a_view_of_no_pixels_is_refused() -> None:

@@ -137,6 +137,18 @@ def test_a_job_runs_alone_moves_and_resumes(
     assert read_json(moved / "summary.json")["counts"]["added"] > 0
 
 
+def test_stages_that_were_emptied_or_exchanged_run_again(scene_folder: Path, tmp_path: Path) -> None:
+    """A full disk leaves files of 0 bytes; they ended the next run with EOFError."""
+    job = tmp_path / "job"
+    remove(scene_folder, tmp_path / "first.ply", "--job", job)
+    stages = sorted((job / "stages").glob("*.npz"))
+    assert len(stages) > 5
+    for k, stage in enumerate(stages):
+        stage.write_bytes(b"" if k % 2 else stages[0].read_bytes()[:-1])
+    remove(scene_folder, tmp_path / "second.ply", "--job", job, "--resume")
+    assert (tmp_path / "second.ply").read_bytes() == (tmp_path / "first.ply").read_bytes()
+
+
 def test_variants_are_other_fills_of_the_same_hole(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
     out, job = tmp_path / "out.ply", ("--job", tmp_path / "job", "--summary", tmp_path / "s.json")
     remove(scene_folder, out, *job, "--variants", 3, "--report", tmp_path / "report")
@@ -390,6 +402,8 @@ BAD = {  # the command, its exit code, and what its error says
     "negative margin": (f"{REMOVE} --set masks.margin=-1", 2, "masks.margin: must be from 0 to 1000, got -1"),
     "NaN for a setting": (f"{REMOVE} --set masks.selection.support=nan", 2, "a finite number"),
     "a huge setting": (f"{REMOVE} --set masks.margin=1000000000", 2, "from 0 to 1000"),
+    "charts of no pixels": (f"{REMOVE} --set charts.largest=0", 2, "charts.largest: must be from 1 to 1000, got 0"),
+    "surroundings of no cells": (f"{REMOVE} --set surroundings.cells=0", 2, "no setting"),
     "no samples": (f"{REMOVE} --set depth.unknowns=0", 2, "from 1 to"),
     "an unknown word for a setting": (f"{REMOVE} --set masks.mode=some", 2, "need or paper expected"),
     "a file for a job": ("remove --job roi.json", 2, "job.json"),

@@ -219,6 +219,21 @@ def test_a_killed_removal_goes_on_to_the_same_bytes(folder: Path) -> None:
         assert not list((folder / name).rglob(f".*{UNFINISHED}"))
 
 
+@posix
+@pytest.mark.usefixtures("at_once")
+def test_what_a_killed_run_left_of_a_variant_is_swept(folder: Path) -> None:
+    """Variants' stages lie in folders of their own."""
+    stages = folder / "job" / "stages"
+    (stages / "2").mkdir(parents=True)
+    with subprocess.Popen(["true"]) as dead:
+        dead.wait()
+    left = [place / f".seed.npz.x.{dead.pid}{UNFINISHED}" for place in (stages, stages / "2")]
+    for path in left:
+        path.write_bytes(b"half")
+    assert main(options(folder, "--job", folder / "job", "--out", folder / "out.ply")) == 0
+    assert not any(path.exists() for path in left)
+
+
 # -------------------------------------------------------------------------------------------------- nobody who listens
 
 

@@ -60,7 +60,7 @@ def cases() -> Iterator[Any]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="no alarm clock on this system")
-@pytest.mark.parametrize(("key", "value"), cases())
+@pytest.mark.parametrize(("key", "value"), list(cases()))
 def test_a_setting_at_its_bound_is_done_or_refused(
     key: str, value: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

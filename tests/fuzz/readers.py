@@ -5,14 +5,19 @@ A reader takes anything or raises what it documents. Used by tests/fuzz and by t
 
 from __future__ import annotations
 
+import atexit
+import gzip
 import json
 import math
+import os
 import random
+import shutil
 import sys
 import tempfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +27,21 @@ import numpy as np
 TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS / "core" / "io")]
 
+from onnx_files import model, pixelwise
 from test_formats import WRITERS, sog_files, some
 
 from gimp3d.box import Box, read_region
 from gimp3d.camera import Camera
-from gimp3d.errors import Gimp3dError
+from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.io.cameras import camera_id, read_cameras
 from gimp3d.io.formats import _from_sog, read_scene
 from gimp3d.io.images import load_view, read_image
 from gimp3d.io.ply import _parse_header, write_gaussians
 from gimp3d.job import RemovalJob, load_job, save_job
+from gimp3d.priors import servers
+from gimp3d.priors.monodepth import _from_file
+from gimp3d.priors.onnx import read_model
+from gimp3d.priors.servers import _Asked, _Automatic, _Comfy, _said, _Server, _workflow
 from gimp3d.schema import checked, parse_json
 from gimp3d.settings import job_settings
 from gimp3d.store import StageStore
@@ -42,6 +52,7 @@ NASTY: tuple[Any, ...] = (
     *(math.nan, math.inf, -math.inf, "", "0", "\ud800", "..", "../x", "/etc/passwd", "a" * 300, "\0", "C:\\x"),
     *([], {}, [[]], [None], {"": None}, [1, 2, 3], [[1, 0, 0, 0]] * 4, [0] * 16, "nan", "OPENCV_FISHEYE"),
 )
+SEPARATOR = b"\n====\n"  # of files that are read together
 TOKENS = (b"0", b"-1", b"nan", b"1e999", b"\0", b"\xff" * 4, b"\xff" * 8, b"\x7f\xff\xff\xff", b"\n", b" ", b"9" * 30)
 
 
@@ -69,8 +80,10 @@ class Reader:
 
 @cache
 def place() -> Path:
-    shared = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="gimp3d-fuzz-", dir=shared if shared.is_dir() else None))
+    in_memory = "TMPDIR" not in os.environ and Path("/dev/shm").is_dir()
+    folder = tempfile.mkdtemp(prefix="gimp3d-fuzz-", dir="/dev/shm" if in_memory else None)
+    atexit.register(shutil.rmtree, folder, True)
+    return Path(folder)
 
 
 def in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], object]:
@@ -103,7 +116,19 @@ FRAMES = [{**FRAME, "split": "test"}, {**FRAME, "file_path": "b"}]
 TRANSFORMS = {"camera_model": "OPENCV", "camera_angle_x": 0.8, "w": 8, "h": 6, "frames": FRAMES}
 PLACED = {"rotation": np.eye(3).tolist(), "position": [0, 0, 1]}
 INRIA = [{"img_name": "a", **PLACED, "fx": 5, "fy": 5, "width": 9, "height": 9}]
+COLMAP_TEXTS = b"1 PINHOLE 8 6 5 5 4 3", b"1 1 0 0 0 0 0 0 1 a.png\n\n"
 BOX = {"center": [0, 0, 0], "size": [1, 1, 1], "rotation_wxyz": [1, 0, 0, 0]}
+WORKFLOW = {"1": {"class_type": "LoadImage", "inputs": {"image": "{image}", "mask": "{mask}", "seed": "{seed}"}}}
+COMFY = {
+    "comfy": True, "upload": {"name": "a.png", "subfolder": "b", "type": "input"}, "/prompt": {"prompt_id": "p"},
+    "object_info": {"CheckpointLoaderSimple": {"input": {"required": {"ckpt_name": [["inpaint.ckpt"], {}]}}}},
+    "history": {"p": {"status": {"status_str": "success", "messages": [["execution_success", {}]]},
+                      "outputs": {"9": {"images": [{"filename": "a.png", "subfolder": "", "type": "output"}]}}}},
+    "queue": {"queue_running": [[1, "p", {}]]}, "view": "a picture",
+}  # fmt: skip
+AUTOMATIC = {"img2img": {"images": ["data:image/png;base64,AAAA"]}, "progress": {"progress": 0.5}}
+REFUSED = {"error": {"message": "m", "details": "d"}, "detail": "d", "errors": "e",
+           "node_errors": {"1": {"class_type": "c", "errors": [{"message": "m", "details": "d"}]}}}  # fmt: skip
 SETTINGS = {"masks.margin": "2", "seed.opacity": "0.9", "refine.steps": "0", "depth.scale_factor": "none"}
 
 
@@ -115,7 +140,7 @@ def read_colmap(kind: str) -> Callable[[bytes], object]:
     """Data hold both files: what comes before the first separator is cameras."""
 
     def read(data: bytes) -> object:
-        head, _, tail = data.partition(b"====")
+        head, _, tail = data.partition(SEPARATOR)
         folder = place() / f"colmap_{kind}"
         folder.mkdir(exist_ok=True)
         (folder / f"cameras.{kind}").write_bytes(head)
@@ -130,7 +155,7 @@ def colmap_seeds() -> list[bytes]:
 
     lens = struct.pack("<Q", 1) + struct.pack("<iiQQ", 1, 1, 8, 6) + struct.pack("<4d", 5, 5, 4, 3)
     pose = struct.pack("<Q", 1) + struct.pack("<i7di", 1, 1, 0, 0, 0, 0, 0, 1, 1) + b"a.png\0" + struct.pack("<Q", 0)
-    return [lens + b"====" + pose]
+    return [lens + SEPARATOR + pose]
 
 
 def read_sog(data: bytes) -> object:
@@ -142,6 +167,40 @@ def read_sog(data: bytes) -> object:
 @cache
 def sog_seed() -> dict[str, bytes]:
     return sog_files(some(20))
+
+
+def sog_descriptions() -> list[bytes]:
+    """Version 2 with codebooks of few digits, which take less time, and version 1 with ranges in their place."""
+    meta = json.loads(sog_seed()["meta.json"])
+    channels = {"scales": 3, "sh0": 4, "shN": 3}
+    books = {part: {**meta[part], "codebook": list(range(256))} for part in channels}
+    ranges = {k: {"mins": [-1] * n, "maxs": [1] * n, "files": meta[k]["files"]} for k, n in channels.items()}
+    first = {"version": 1, "means": {**meta["means"], "shape": [meta["count"], 3]}}
+    return dumped({**meta, **books}, {**meta, **ranges, **first})()
+
+
+def read_sog_parts(data: bytes) -> object:
+    """All of a SOG's files, as no archive's checksums guard them."""
+    files = dict(zip(sog_seed(), data.split(SEPARATOR)))
+    return _from_sog(lambda name, most: files[name][:most], Path("x.sog"))
+
+
+def spz_inside(name: str) -> Reader:
+    """What gzip's checksum guards."""
+    read, seeds = in_file(name, read_scene), scene_seed(name)
+    return Reader(
+        f"{name} inside", lambda data: read(gzip.compress(data, 1)), lambda: [gzip.decompress(s) for s in seeds()]
+    )
+
+
+def with_checksums(png: bytes) -> bytes:
+    """A PNG whose chunks have the checksums that they should have."""
+    mended, at = bytearray(png), 8
+    while at + 12 <= len(png):
+        size = int.from_bytes(png[at : at + 4], "big")
+        mended[at + 8 + size : at + 12 + size] = zlib.crc32(png[at + 4 : at + 8 + size]).to_bytes(4, "big")
+        at += 12 + size
+    return bytes(mended)
 
 
 def read_settings(data: bytes) -> object:
@@ -156,6 +215,48 @@ def read_photo(path: Path) -> object:
 def picture(kind: str) -> Callable[[], list[bytes]]:
     noise = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
     return lambda: [cv2.imencode(kind, noise)[1].tobytes()]
+
+
+class Answers(_Server):
+    """A server that says the same to every question of a kind, until it has been asked often."""
+
+    def __init__(self, document: Any) -> None:
+        self.option, self.url, self.seconds = "x", "http://localhost:1", 1.0
+        self.document, self.left = document, 9
+
+    def _ask(self, path: str, *_: Any) -> bytes:
+        self.left -= 1
+        if not self.left:
+            raise BadInput("asked too often")
+        return json.dumps(next((a for kind, a in self.document.items() if kind in path), None)).encode()
+
+
+def read_answers(data: bytes) -> object:
+    """What ComfyUI and A1111 say, whoever they are."""
+    servers.POLL = 0.0
+    document = checked(dict[str, Any], parse_json(data, "x"), "x")
+    if "error" in document:
+        return _said(data)
+    values = {"prompt": "", "negative": "", "seed": 0, "strength": 1, "checkpoint": ""}
+    asked = _Asked(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
+    painting = _Comfy(Answers(document), None) if document.pop("comfy", False) else _Automatic(Answers(document))
+    painting.words()
+    return painting.paint(asked)
+
+
+def read_depth(name: str) -> Callable[[bytes], object]:
+    return in_file(name, lambda path: _from_file(path, 6, 8))
+
+
+def depth_seeds() -> list[bytes]:
+    depth = np.linspace(1, 2, 48, dtype=np.float32).reshape(6, 8)
+    arrays = depth, depth.astype(">f8")
+    return [file_seeds(partial(np.save, arr=array), "d.npy")()[0] for array in arrays]
+
+
+def onnx_seed() -> list[bytes]:
+    node = pixelwise("image", "y", np.eye(3))
+    return [model([node], {"image": (1, 3, "h", "w")}, (1, 3, "h", "w"))]
 
 
 def stage_seed(path: Path) -> None:
@@ -190,19 +291,27 @@ READERS = {
                lambda: [b"images/a.png", "ä/ü".encode()], needs_files=False),
         Reader("settings", read_settings, dumped(SETTINGS), True, False),
         Reader("ply header", header_of, ply_header, needs_files=False),
-        Reader("sog description", read_sog, lambda: [sog_seed()["meta.json"]], True, False),
+        Reader("sog description", read_sog, sog_descriptions, True, False),
+        Reader("server", read_answers, dumped(COMFY, AUTOMATIC, REFUSED), True, False),
+        Reader("workflow", in_file("w.json", lambda p: _workflow(p, "x")), dumped(WORKFLOW), True),
+        Reader("depth npy", read_depth("d.npy"), depth_seeds),
+        Reader("depth picture", read_depth("d.png"), picture(".png")),
+        Reader("onnx", in_file("m.onnx", lambda p: read_model("x", p)), onnx_seed),
         Reader("transforms", read_json_cameras, dumped(TRANSFORMS), True),
         Reader("inria", read_json_cameras, dumped(INRIA), True),
         Reader("colmap bin", read_colmap("bin"), colmap_seeds),
-        Reader("colmap txt", read_colmap("txt"), lambda: [b"1 PINHOLE 8 6 5 5 4 3\n====1 1 0 0 0 0 0 0 1 a.png\n\n"]),
+        Reader("colmap txt", read_colmap("txt"), lambda: [SEPARATOR.join(COLMAP_TEXTS)]),
         Reader("roi", in_file("r.json", read_region), dumped(BOX, [BOX, BOX]), True),
         Reader("job", in_file("job.json", lambda p: load_job(p.parent)), file_seeds(job_seed), True),
         Reader("stage", in_file("stage.npz", lambda p: StageStore(p.parent, "key", (Camera, Box), True).load("stage")),
                file_seeds(stage_seed)),
         Reader("photo png", in_file("p.png", read_photo), picture(".png")),
+        Reader("photo png inside", lambda d: in_file("p.png", read_photo)(with_checksums(d)), picture(".png")),
         Reader("photo jpg", in_file("p.jpg", read_photo), picture(".jpg")),
         Reader("ply", in_file("s.ply", read_scene), file_seeds(lambda p: write_gaussians(p, some(20)), "s.ply")),
         *(Reader(name, in_file(name, read_scene), scene_seed(name)) for name in WRITERS),
+        *(spz_inside(name) for name in ("1.spz", "2.spz", "3.spz")),
+        Reader("sog parts", read_sog_parts, lambda: [SEPARATOR.join(sog_seed().values())]),
     )
 }  # fmt: skip
 

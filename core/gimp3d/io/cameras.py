@@ -20,9 +20,9 @@ from ..errors import BadInput
 from ..files import require_file, write_json
 from ..gaussians import quats_to_matrices
 from ..schema import Between, checked, read_json, shown
+from .picture_size import LARGEST_PICTURE, LARGEST_SIDE
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
-LARGEST_SIDE, LARGEST_PICTURE = (1 << 16) - 1, 1 << 27  # pixels
 NARROWEST, WIDEST = 1e4, 1e-3  # focal lengths over the picture's width: views of a hundredth and of 179.9 degrees
 LONGEST_NAME = 200  # bytes of each part of an ID: file systems allow 255, and our own endings come behind it
 LONGEST_ID = 1000

@@ -20,6 +20,7 @@ from ..files import require_file
 from ..gaussians import SH_C0, Gaussians
 from ..memory import GAUSSIAN, require_memory
 from ..schema import checked, parse_json
+from .picture_size import announced_pixels
 from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -291,31 +292,18 @@ def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     """A picture [H, W, 4] uint8, RGBA, of at most so many pixels."""
     try:
         import cv2
+
+        from .images import decoded
     except ImportError:
         raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
-    if _webp_pixels(data) > most:
+    if announced_pixels(data) > most:
         raise BadInput(f"{path}: a picture of the SOG scene is far larger than its count needs")
-    try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except cv2.error:
-        picture = None
-    if picture is None or picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
-        raise BadInput(f"{path}: a picture of the SOG scene cannot be read")
+    picture = decoded(data, f"{path}: a part of the SOG scene")
+    if picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
+        raise BadInput(f"{path}: a picture of the SOG scene is of another kind")
     if picture.shape[2] == 3:
         return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
     return cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA)
-
-
-def _webp_pixels(data: bytes) -> int:
-    """How many pixels a WebP's header announces; 0 for other files, of which OpenCV has a limit of its own."""
-    if data[8:12] != b"WEBP" or len(data) < 30:
-        return 0
-    if data[12:16] == b"VP8L":
-        sizes = int.from_bytes(data[21:25], "little")
-        return ((sizes & 0x3FFF) + 1) * ((sizes >> 14 & 0x3FFF) + 1)
-    if data[12:16] == b"VP8X":
-        return (int.from_bytes(data[24:27], "little") + 1) * (int.from_bytes(data[27:30], "little") + 1)
-    return (int.from_bytes(data[26:28], "little") & 0x3FFF) * (int.from_bytes(data[28:30], "little") & 0x3FFF)
 
 
 def _unpack(packed: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> np.ndarray:

@@ -11,8 +11,11 @@ import numpy as np
 from ..camera import Camera
 from ..errors import BadInput
 from ..files import require_file, write_atomically
+from ..memory import require_memory
+from .picture_size import announced_pixels, is_broken_png, most_pixels
 
 SMALLEST = 1 / 16  # of a camera's width: a photo of less is a thumbnail or a mistake
+PIXEL = 16  # bytes that a picture takes while it is read, about: of 8 bits and three channels 9, with alpha 28
 ASPECT_TOLERANCE = 1.5  # px by which a photo's size may differ from the scaled camera's, from rounding
 
 
@@ -25,15 +28,15 @@ def read_image(path: Path | str) -> np.ndarray:
         If it is missing or not a picture.
     """
     try:
-        data = np.fromfile(require_file(Path(path)), np.uint8)  # cv2.imread fails on non-ASCII names on Windows
+        data = require_file(Path(path)).read_bytes()  # cv2.imread fails on non-ASCII names on Windows
     except OSError as error:
         raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
     return decode_image(data, str(path))
 
 
-def decode_image(data: np.ndarray | bytes, name: str) -> np.ndarray:
+def decode_image(data: bytes, name: str) -> np.ndarray:
     """A picture file's bytes, as `read_image` gives them; `name` is for messages."""
-    picture = _decoded(np.frombuffer(data, np.uint8), name)
+    picture = decoded(data, name)
     if picture.dtype == np.uint16:
         picture = (picture.astype(np.uint32) * 255 + 32767) // 65535
     elif picture.dtype != np.uint8:
@@ -47,6 +50,29 @@ def decode_image(data: np.ndarray | bytes, name: str) -> np.ndarray:
     elif picture.shape[2] == 4:
         picture = picture[..., :3].astype(np.uint32) * picture[..., 3:] // 255
     return np.ascontiguousarray(picture[..., 2::-1].astype(np.uint8))
+
+
+def decoded(data: bytes, name: str, way: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
+    """A picture file's bytes as OpenCV gives them; no memory is taken for what they only claim.
+
+    Raises
+    ------
+    BadInput
+        If they are no picture, or one that claims more than they can hold.
+    """
+    if is_broken_png(data):
+        raise BadInput(f"{name} is not a picture that can be read (a PNG that is cut off or damaged)")
+    size = announced_pixels(data)
+    if size > most_pixels(data):
+        raise BadInput(f"{name} claims {size:,} pixels, more than such a file can hold")
+    require_memory(PIXEL * size, f"{name} with {size:,} pixels")
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), way) if len(data) else None
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise BadInput(f"{name} is not a picture that can be read")
+    return picture
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -114,13 +140,3 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
         at_integers = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's pixel centres are whole numbers
         photo = cv2.undistort(photo, at_integers, camera.distortion.coefficients)
     return photo, undistorted(camera)
-
-
-def _decoded(data: np.ndarray, name: str) -> np.ndarray:
-    try:
-        picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    except cv2.error:
-        picture = None
-    if picture is None:
-        raise BadInput(f"{name} is not a picture that can be read")
-    return picture

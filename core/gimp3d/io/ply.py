@@ -387,7 +387,7 @@ def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
     records = np.zeros(len(added), table.dtype)
     for part, of_part in _layout(added.log_scales.shape[1], rest).items():
         for name, column in zip(of_part, getattr(padded, part).reshape(len(added), len(of_part)).T):
-            if name in (table.dtype.names or ()):
+            if name in (records.dtype.names or ()):
                 records[name] = column
     return records
 

@@ -10,20 +10,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 
 import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..files import require_file
+from ..io.images import decoded
 from ..solvers.robust import robust_fit
 from . import command, torchscript
-from .calls import Call, waited
+from .calls import Call, one_line, waited
 from .networks import IMAGENET_MEAN, IMAGENET_STD, as_depth, path_and_size
 from .onnx import OnnxModel, read_model
 from .pasting import scaled
 
 KINDS = ("disparity", "depth", "metric")
 FREE_SIZE = (518, 518)  # (width, height) for models that take any size: 37 patches of 14 px, as Depth Anything
+# what NumPy raises for a file whose header is read as Python is
+NO_ARRAY = (EOFError, OSError, OverflowError, SyntaxError, TokenError, TypeError, ValueError)
 LOOKING = ("onnx", "torchscript", "command")  # providers that look at a picture of the view
 USAGE = (
     "use auto, harmonic, planar, file:PATH, onnx:PATH, torchscript:PATH or command:CMD, followed by ,disparity ,depth "
@@ -152,12 +157,13 @@ def _affine(m: np.ndarray, disparity: np.ndarray) -> tuple[float, float]:
 def _from_file(path: Path, height: int, width: int) -> np.ndarray:
     try:
         if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = np.load(require_file(path), allow_pickle=False)
         else:
-            values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+            data = require_file(path).read_bytes()
+            values = decoded(data, f"--depth-prior: {path}", cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
         values = np.asarray(values, np.float32)
-    except (OSError, ValueError, TypeError, cv2.error) as error:
-        raise BadInput(f"--depth-prior: cannot read {path} ({error})") from None
+    except NO_ARRAY as error:
+        raise BadInput(f"--depth-prior: cannot read {path} ({one_line(error)})") from None
     if values.ndim != 2 or values.size == 0:
         raise BadInput(f"--depth-prior: {path} is not a depth picture of one channel")
     if abs(values.shape[1] * height - values.shape[0] * width) > 1.5 * max(values.shape[0], height):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import ipaddress
 import json
@@ -24,6 +23,7 @@ import numpy as np
 
 from ..errors import BadInput
 from ..io.images import decode_image, encode_png
+from ..schema import parse_json, read_json
 from .appearance import Painter, Unfinished
 from .builtin import telea
 from .calls import Call, one_line, waited
@@ -37,6 +37,7 @@ POLL = 0.25  # s between two looks whether ComfyUI is done
 QUICK = 2.0  # s that a word of progress or the end of the work may take
 PROGRESS = "/sdapi/v1/progress?skip_current_image=true"
 MOST_BYTES = 256 << 20  # of an answer
+NO_ANSWER = (AttributeError, LookupError, OverflowError, TypeError, ValueError)  # of JSON that says something else
 PROMPT = "photograph of the empty place, surfaces and textures of the surroundings continued, nothing standing there"
 NEGATIVE = "object, person, text, watermark, frame, blurry"
 
@@ -178,8 +179,8 @@ class _Server:
 
     def _json(self, data: bytes) -> Any:
         try:
-            return json.loads(data)
-        except ValueError:
+            return parse_json(data, self.url)
+        except BadInput:
             self.misunderstood(data[:60].decode("utf-8", "replace"))
 
     def misunderstood(self, what: str) -> NoReturn:
@@ -213,6 +214,12 @@ class _Comfy:
     stopped: bool = False
 
     def paint(self, asked: _Asked) -> bytes:
+        try:
+            return self._paint(asked)
+        except NO_ANSWER as error:
+            self.server.misunderstood(f"{type(error).__name__}: {error}")
+
+    def _paint(self, asked: _Asked) -> bytes:
         server = self.server
         values = dict(asked.values)
         for name, picture in (("image", asked.image), ("mask", asked.mask)):
@@ -242,7 +249,7 @@ class _Comfy:
         found = self.server.get(f"/object_info/{loader}")
         try:
             names = [str(name) for name in found[loader]["input"]["required"]["ckpt_name"][0]]
-        except (KeyError, IndexError, TypeError):
+        except NO_ANSWER:
             self.server.misunderstood(json.dumps(found))
         if not names or (wanted and wanted not in names):
             there = f"it has {', '.join(names)}" if names else "put one into its models/checkpoints"
@@ -277,7 +284,7 @@ class _Comfy:
         self.stopped = True
         if not self.prompt_id:
             return
-        with suppress(BadInput, AttributeError):
+        with suppress(BadInput, *NO_ANSWER):
             if self._is_running():
                 self.server.post("/interrupt", {"prompt_id": self.prompt_id}, QUICK)
             else:
@@ -306,11 +313,11 @@ class _Automatic:
         try:
             text = answer["images"][0]
             return base64.b64decode(text.partition(",")[2] if text.startswith("data:") else text, validate=True)
-        except (KeyError, IndexError, TypeError, AttributeError, binascii.Error):
+        except NO_ANSWER:
             self.server.misunderstood(json.dumps(answer)[:60])
 
     def words(self) -> str:
-        with suppress(BadInput, TypeError, KeyError, ValueError):
+        with suppress(BadInput, *NO_ANSWER):
             return f"paints, {float(self.server.get(PROGRESS, QUICK)['progress']):.0%}"
         return "paints"
 
@@ -336,18 +343,13 @@ def filled(workflow: Any, values: Mapping[str, Any]) -> Any:
 
 def _workflow(path: Path, option: str) -> dict[str, Any]:
     """A user's workflow: it takes {image} and {mask}, and if it likes {prompt}, {negative}, {seed}, {strength}, …"""
-    try:
-        text = path.read_text(encoding="utf-8")
-        workflow = json.loads(text)
-    except OSError as error:
-        raise BadInput(f"{option}: cannot read {path} ({error.strerror})") from None
-    except ValueError as error:
-        raise BadInput(f"{option}: {path} is no workflow ({error})") from None
+    workflow = read_json(path, option)
     nodes = workflow.values() if isinstance(workflow, dict) else []
     if not nodes or not all(isinstance(node, dict) and "class_type" in node for node in nodes):
         raise BadInput(
             f"{option}: {path} is no workflow in API format; export it in ComfyUI by Workflow › Export (API)"
         )
+    text = json.dumps(workflow)
     missing = [name for name in ('"{image}"', '"{mask}"') if name not in text]
     if missing:
         raise BadInput(f"{option}: {path} takes no {' and no '.join(missing)}; write that where a file's name stands")
@@ -357,8 +359,8 @@ def _workflow(path: Path, option: str) -> dict[str, Any]:
 def _said(body: bytes) -> str:
     """What an error's body says, in one line: ComfyUI's, A1111's, or any text."""
     text = body.decode("utf-8", "replace")
-    with suppress(ValueError, AttributeError, TypeError):
-        document = json.loads(text)
+    with suppress(BadInput, *NO_ANSWER):
+        document = parse_json(body, "")
         error = document.get("error")
         parts = [error.get("message"), error.get("details")] if isinstance(error, dict) else [error]
         for node in (document.get("node_errors") or {}).values():

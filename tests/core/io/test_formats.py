@@ -422,6 +422,16 @@ def test_a_picture_far_larger_than_the_count_needs_is_refused(tmp_path: Path) ->
         read_scene(tmp_path)
 
 
+def test_a_part_that_claims_more_than_it_holds_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = sog_files(some(10))
+    sound = cv2.imencode(".png", np.zeros((2, 20, 4), np.uint8))[1].tobytes()
+    for name, data in {**files, "means_l.webp": sound[:33] + b"\x0f" + sound[34:]}.items():
+        (tmp_path / name).write_bytes(data)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(BadInput, match="not a picture"):
+        read_scene(tmp_path)
+
+
 def test_what_is_no_scene_is_said(tmp_path: Path) -> None:
     for name, data, words in [
         ("a.txt", b"hello there", "not a PLY, nor"),

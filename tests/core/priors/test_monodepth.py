@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +24,11 @@ from gimp3d.priors.monodepth import (
 )
 from gimp3d.priors.networks import IMAGENET_MEAN, IMAGENET_STD
 from gimp3d.priors.onnx import read_model
+
+
+def array_file(header: str) -> bytes:
+    """A .npy file whose header says so."""
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
 
 
 def test_the_scene_alone_decides_without_a_file():
@@ -226,11 +233,37 @@ def test_a_command_writes_what_a_file_would_hold(tmp_path, out, write):
 
 
 @pytest.mark.parametrize(
+    "name, data",
+    [
+        ("d.npy", b""),
+        ("d.npy", array_file("{'descr': '<f4', 'fortran_order': False, 'shape': (6, 8,)")),  # no end
+        ("d.npy", array_file("{'descr': '>08', 'fortran_order': False, 'shape': (6, 8)}")),
+        ("d.npy", array_file("{'descr': '<f4', 'fortran_order': False, 'shape': (6, %s)}" % ("9" * 30))),
+        ("d.npy", array_file("{\n    'descr': '<f4'\n  }")),
+        ("d.png", b""),
+        ("d.png", b"\x89PNG\r\n\x1a\n" + b"\x0f" * 60),
+    ],
+)
+def test_files_that_hold_no_depths_are_told_in_one_line(name: str, data: bytes, tmp_path: Path) -> None:
+    """Found by make fuzz: NumPy reads headers as Python, and each of these fails there in another way."""
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(BadInput) as error:
+        depth_prior(f"file:{tmp_path / name},depth", 6, 8)
+    assert str(error.value).startswith("--depth-prior: ") and "\n" not in str(error.value)
+
+
+def test_a_pipe_of_depths_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "d.npy")
+    with pytest.raises(BadInput, match="is a pipe"):
+        depth_prior(f"file:{tmp_path / 'd.npy'},depth", 6, 8)
+
+
+@pytest.mark.parametrize(
     "body, out, words",
     [
         ("sys.exit('no weights')", "{npy}", "ended with 1: no weights"),
         ("pass", "{npy}", "wrote neither {out} nor {npy}"),
-        ("open(out, 'w').write('text')", "{out}", "not a depth picture"),
+        ("open(out, 'w').write('text')", "{out}", "not a picture"),
         ("np.save(out, np.ones((9, 9, 3)))", "{npy}", "not a depth picture of one channel"),
         ("np.save(out, np.full((30, 40), np.nan))", "{npy}", "gives no finite value"),
         ("np.save(out, np.ones((30, 80)))", "{npy}", "not the shape of the view"),

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pictures import disc, holed, inner, refuse, scenery
-from stand_ins import COLOUR, Automatic, Comfy, StandIn, serving
+from stand_ins import COLOUR, Automatic, Comfy, Handler, StandIn, serving
 
 from gimp3d.errors import BadInput, Cancelled
 from gimp3d.io.images import decode_image
@@ -105,7 +106,7 @@ def test_comfyuis_complaints_about_a_workflow_are_told(comfy: Comfy, tmp_path: P
     ("text", "words"),
     [
         (None, "cannot read"),
-        ("no json", "is no workflow"),
+        ("no json", "is not JSON"),
         ('{"nodes": [], "links": []}', "is no workflow in API format"),
         ('{"1": {"class_type": "LoadImage", "inputs": {"image": "{image}"}}}', 'takes no "{mask}"'),
         ("[]", "is no workflow in API format"),
@@ -229,6 +230,43 @@ def test_other_servers_are_refused(server: StandIn, words: str) -> None:
     """A redirection is not followed: pictures for this machine must not end on another one."""
     with serving(server):
         refuse(words, server.url, scenery(), disc())
+
+
+@pytest.mark.parametrize(
+    ("server", "path", "answer"),
+    [
+        (Comfy(), "/upload/image", ["a.png"]),
+        (Comfy(), "/upload/image", {"name": 5, "subfolder": {}}),
+        (Comfy(), "/prompt", 5),
+        (Comfy(), "/history/the-prompt", None),
+        (Comfy(), "/history/the-prompt", {"the-prompt": []}),
+        (Comfy(), "/history/the-prompt", {"the-prompt": {"status": {"messages": [5]}}}),
+        (Comfy(), "/history/the-prompt", {"the-prompt": {"outputs": {"9": {"images": ["a.png"]}}}}),
+        (Automatic(), "/sdapi/v1/img2img", {"images": ["\u00e4"]}),
+        (Automatic(), "/sdapi/v1/img2img", b"[" * 100_000),
+    ],
+)
+def test_answers_that_say_something_else_are_told_in_one_line(
+    server: StandIn, path: str, answer: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by make fuzz."""
+    well = server.answer
+
+    def garbled(handler: Handler, asked: str, *more: Any) -> tuple[int, Any]:
+        return (200, answer) if asked == path else well(handler, asked, *more)
+
+    monkeypatch.setattr(server, "answer", garbled)
+    with serving(server):
+        assert "\n" not in refuse("cannot understand what", server.url, scenery(), disc())
+
+
+@pytest.mark.parametrize("said", [{"node_errors": {"1": {}}}, {"node_errors": {"1": {"errors": [{}]}}}, [], 5])
+def test_refusals_that_give_no_reason_are_told(said: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found by make fuzz."""
+    server = Nothing()
+    monkeypatch.setattr(server, "answer", lambda *_: (400, said))
+    with serving(server):
+        refuse(r"refused \(400", server.url, scenery(), disc())
 
 
 def test_a_server_that_is_not_running_is_told() -> None:
