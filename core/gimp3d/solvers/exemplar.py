@@ -31,7 +31,7 @@ from .regularity import continue_regularly, find_motions
 from .surface import TangentPlanes, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-OWN = 2  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
+OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
