@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import stat
 import sys
 import tempfile
@@ -27,6 +28,18 @@ def user_state_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library/Application Support/gimp3d"
     return Path(os.environ.get("XDG_STATE_HOME", Path.home() / ".local/state")) / "gimp3d"
+
+
+def user_secret() -> bytes:
+    """32 random bytes that this user's runs on this machine share; others each time where they cannot be kept."""
+    path = user_state_folder() / "secret"
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with suppress(FileExistsError), open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(secrets.token_bytes(32))
+        if len(found := path.read_bytes()) == 32:
+            return found
+    return secrets.token_bytes(32)
 
 
 def require_file(path: Path) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import hmac
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from .files import write_atomically
+from .files import user_secret, write_atomically
 
 
 class StageStore:
     """Keeps each stage's result in `folder` under the key of the whole job's inputs.
 
     A result of another key (other scene, cameras or program version) or of other settings is ignored and overwritten,
-    and so is a file that is damaged or no stage's at all: each carries a checksum.
+    and so is a file that is damaged, no stage's at all, or written by anybody else: each carries a checksum that only
+    this user's runs on this machine can make, as kernels trust the shapes of what stages hand on.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class StageStore:
         self.folder, self.key, self.resume = folder, key, resume
         self.settings = json.loads(json.dumps(settings or {}))  # tuples as they come back
         self.kinds = {kind.__name__: kind for kind in kinds}
+        self.secret = user_secret()
 
     def load(self, name: str) -> Any | None:
         """The stage's stored result, or None if there is none of this key, it is damaged or no longer understood."""
@@ -44,7 +46,7 @@ class StageStore:
             document = json.loads(bytes(arrays.pop("document")).decode())
             if document["key"] != self.key or document["settings"] != self.settings:
                 return None
-            if document["checksum"] != _checksum(document["result"], arrays):
+            if not hmac.compare_digest(document["checksum"], self._checksum(document["result"], arrays)):
                 return None
             return self._decode(document["result"], arrays)
         except Exception:  # empty, damaged, somebody else's, of an older version: whatever it is, the stage runs again
@@ -55,9 +57,16 @@ class StageStore:
         arrays: dict[str, np.ndarray] = {}
         encoded = self._encode(result, arrays)
         document = {"key": self.key, "settings": self.settings, "result": encoded}
-        document["checksum"] = _checksum(encoded, arrays)
+        document["checksum"] = self._checksum(encoded, arrays)
         arrays["document"] = np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
         write_atomically(self._path(name), lambda f: np.savez(f, **arrays))  # type: ignore[arg-type]
+
+    def _checksum(self, encoded: Any, arrays: Mapping[str, np.ndarray]) -> str:
+        digest = hmac.new(self.secret, json.dumps(encoded, sort_keys=True).encode(), "sha256")
+        for name, array in sorted(arrays.items()):
+            digest.update(f"{name} {array.dtype} {array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name.replace(' ', '-')}.npz"
@@ -114,11 +123,3 @@ class SharedStages:
     def _keep(self, name: str, result: Any) -> None:
         if name in self.names:
             self.results[name] = result
-
-
-def _checksum(encoded: Any, arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256(json.dumps(encoded, sort_keys=True).encode())
-    for name, array in sorted(arrays.items()):
-        digest.update(f"{name} {array.dtype} {array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()

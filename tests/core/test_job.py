@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -183,6 +184,26 @@ def test_a_stage_file_that_is_none_is_no_stage(harm: str, tmp_path: Path) -> Non
     assert store.load("stage") is not None
     HARM[harm](tmp_path / "stage.npz")
     assert store.load("stage") is None
+
+
+def test_stages_of_somebody_else_are_no_stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels trust the shapes of what stages hand on, so nobody else may choose them."""
+    monkeypatch.setenv("GIMP3D_STATE", str(tmp_path / "somebody"))
+    StageStore(tmp_path / "job", "key", (), resume=True).save("stage", np.full(3, 10**6))
+    assert StageStore(tmp_path / "job", "key", (), resume=True).load("stage") is not None
+    monkeypatch.setenv("GIMP3D_STATE", str(tmp_path / "me"))
+    assert StageStore(tmp_path / "job", "key", (), resume=True).load("stage") is None
+    if os.name == "posix":
+        assert (tmp_path / "me" / "secret").stat().st_mode & 0o077 == 0
+
+
+def test_where_no_secret_can_be_kept_stages_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("GIMP3D_STATE", str(tmp_path / "file" / "state"))
+    store = StageStore(tmp_path, "key", (), resume=True)
+    store.save("stage", 5)
+    assert store.load("stage") == 5
+    assert StageStore(tmp_path, "key", (), resume=True).load("stage") is None
 
 
 def test_a_result_of_which_the_program_no_longer_knows_the_fields_is_made_again(tmp_path: Path) -> None:
