@@ -25,7 +25,8 @@ LIKE = 0.7  # cosine between the steps on both sides
 ROWS = np.array([-6, -5, -4, -2, -1, 1, 2, 4, 5, 6])  # px across an edge
 FAR_ABOVE, ABOVE, BELOW, FAR_BELOW = slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)
 SHARP = 0.5  # share of the step between what is further from it that it must be: else it is a slope
-BLOCKS, STEADY = 5, 0.5  # of what tells it on either side, in each of which it is this share of the usual step
+BLOCKS, CLOSEST = 5, 3  # that what tells it on either side is cut into, and how many of them it must reach through
+STEADY = 0.5  # share of the usual step that it is in each
 BLOCK = 8  # px, in each of which it is that further off, as far as it goes
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
@@ -209,14 +210,15 @@ def _step(sums: np.ndarray, above: slice = ABOVE, below: slice = BELOW) -> np.nd
 
 
 def _is_edge(sums: np.ndarray) -> bool:
-    """Whether colours step all along a line, and at once."""
+    """Whether colours step at once, and all along a line near the hole: further off it may end, as at a corner."""
     pixels = sums[..., 0].sum(0).cumsum()
     block = np.minimum((BLOCKS * pixels / max(pixels[-1], 1)).astype(int), BLOCKS - 1)
     whole = _step(sums)
     size = max(float(np.linalg.norm(whole)), 1e-9)
     each = np.array([_step(sums[:, block == k]) for k in range(BLOCKS)]) @ whole / size
     sharp = size**2 >= SHARP * (_step(sums, FAR_ABOVE, FAR_BELOW) @ whole)
-    return bool(sharp and each.min() >= STEADY * np.median(each))
+    near = each[:CLOSEST]
+    return bool(sharp and near.min() >= STEADY * np.median(near))
 
 
 def _length(sums: np.ndarray, whole: np.ndarray) -> int:
