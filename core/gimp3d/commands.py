@@ -448,7 +448,7 @@ def _scene_warnings(file: SplatFile) -> list[str]:
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:
     """A hash of everything that a stage's result depends on."""
     digest = hashlib.sha256(__version__.encode())
-    free = ("out", "views_out", "report", "summary", "threads", "device")
+    free = ("out", "views_out", "report", "summary", "threads", "device", "variants")
     files = ("scene", "cameras", "roi", "reference_image")
     settings = {
         k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks", "shadow_masks")

@@ -149,7 +149,12 @@ def test_stages_that_were_emptied_or_exchanged_run_again(scene_folder: Path, tmp
     assert (tmp_path / "second.ply").read_bytes() == (tmp_path / "first.ply").read_bytes()
 
 
-def test_variants_are_other_fills_of_the_same_hole(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
+def test_variants_are_other_fills_of_the_same_hole(
+    scene_folder: Path, completed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def again(*_: object) -> None:
+        raise AssertionError("the stage ran again")
+
     out, job = tmp_path / "out.ply", ("--job", tmp_path / "job", "--summary", tmp_path / "s.json")
     remove(scene_folder, out, *job, "--variants", 3, "--report", tmp_path / "report")
     facts = read_json(tmp_path / "s.json")["variants"]
@@ -165,8 +170,11 @@ def test_variants_are_other_fills_of_the_same_hole(scene_folder: Path, completed
         assert str(path) in (tmp_path / "report" / "index.html").read_text()
     for path in paths:
         path.unlink()
+    monkeypatch.setattr(pipeline, "find_masks", again)
     remove(scene_folder, out, *job, "--variants", 3, "--resume")
     assert [p.read_bytes() for p in paths] == scenes
+    remove(scene_folder, out, *job, "--resume")  # the first of them is the same whatever their number
+    assert out.read_bytes() == scenes[0]
 
 
 @pytest.mark.parametrize(("number", "out"), [(0, "out.ply"), (17, "out.ply"), (2, "/dev/null")])
