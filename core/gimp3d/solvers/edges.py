@@ -40,7 +40,6 @@ class Edge:
     origin: np.ndarray  # [2] (x, y) px, where the hole's middle is nearest
     along: np.ndarray  # [2] unit
     ends: tuple[float, float]  # px along it, between which it is seen or runs through the hole
-    told: float  # times the noise that the step is
 
 
 def find_edges(
@@ -185,7 +184,7 @@ def _settled(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: fl
             steady = steady and _is_edge(near)
             ends.append(float(t[_length(sums, _step(near))]))
         told = float(_told(sides, 2 * LEAST)[0])
-        return told, Edge(origin, along, (ends[0], ends[1]), told) if steady else None
+        return told, Edge(origin, along, (ends[0], ends[1])) if steady else None
 
     values, step = np.zeros(2), 1.0
     best = at(values)

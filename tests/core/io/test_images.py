@@ -66,12 +66,14 @@ def test_a_picture_larger_than_memory_is_refused_unread(tmp_path: Path, monkeypa
         read_image(tmp_path / "p.png")
 
 
-@pytest.mark.parametrize("kind", [".png", ".jpg", ".webp", ".bmp", ".tif"])
-@pytest.mark.parametrize("shape", [(1, 1, 3), (3, 1500, 3), (900, 1200, 3), (64, 64), (64, 64, 4)])
+KINDS = (".png", ".jpg", ".webp", ".bmp", ".tif")
+SHAPES = [(1, 1, 3), (3, 1500, 3), (900, 1200, 3), (64, 64), (64, 64, 4)]
+PLAIN = [(k, s) for k in KINDS for s in SHAPES if (k, s[2:]) != (".jpg", (4,))]  # a JPEG has no alpha
+
+
+@pytest.mark.parametrize(("kind", "shape"), PLAIN)
 def test_plain_pictures_of_one_colour_pass(kind: str, shape: tuple[int, ...], tmp_path: Path) -> None:
     """They hold the most pixels in a byte."""
-    if kind == ".jpg" and shape[-1] == 4:
-        pytest.skip("a JPEG has no alpha")
     (tmp_path / f"p{kind}").write_bytes(cv2.imencode(kind, np.full(shape, 255, np.uint8))[1].tobytes())
     assert (read_image(tmp_path / f"p{kind}") >= 254).all()
 
