@@ -27,7 +27,7 @@ from .stages.masks import Masks, find_masks
 from .stages.propagate import Reference
 from .stages.verdict import Verdict, judge
 from .steps.completion import charts_to_paint, complete_view_depth, turns_of
-from .steps.light import NOT_LIT, Relit, find_light, undo_light
+from .steps.light import NOT_LIT, Relit, find_light, lift_contact, undo_light, with_contact
 from .steps.surfaces import chart_surfaces, find_surfaces
 from .view_state import ViewState, open_pixels
 
@@ -235,16 +235,26 @@ def look_behind(
     if settings.charts is None or masks.mode != "need":
         return Behind(scene, masks, views, (), lit)
     surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
+    found = None
     if settings.shadow != "off":
         found = run("light", find_light, scene, region, masks, surfaces, views, shadow_masks, settings)
         if found.shadow is None and settings.shadow == "mask":
             run.warnings.append(found.why_shadow)
-        lifted = run("lift", undo_light, scene, masks, surfaces, views, found) if found.anything else None
-        lit = Relit.of(found, lifted)
-        run.pictures += pictures.of_light(lit, [v.id for v in views])
-        if lifted is not None:
-            scene, views, surfaces = lit.scene(scene), lit.views(views), surfaces.with_marked(lifted.dark)
-    charted = run("charts", chart_surfaces, scene, region, masks, surfaces, views, settings)
+        lit = Relit.of(found, run("lift", undo_light, scene, masks, surfaces, views, found) if found.anything else None)
+    now, at_lit = lit.scene(scene), lit.views(views)
+    at_surfaces = surfaces if lit.lifted is None else surfaces.with_marked(lit.lifted.dark)
+    charted = run("charts", chart_surfaces, now, region, masks, at_surfaces, at_lit, settings)
+    if found is not None and found.shadow is None and settings.shadow == "auto":
+        contact = run("contact", with_contact, found, charted.charts)
+        if contact.shadow is not None:
+            lifted = run("lift contact", lift_contact, now, masks, at_surfaces, at_lit, contact, lit.lifted)
+            lit = Relit.of(contact, lifted)
+            at_surfaces = surfaces.with_marked(lifted.dark)
+            now, at_lit = lit.scene(scene), lit.views(views)
+            charted = run("charts without contact", chart_surfaces, now, region, masks, at_surfaces, at_lit, settings)
+        lit = Relit.of(contact, lit.lifted)
+    run.pictures += pictures.of_light(lit, [v.id for v in views])
+    scene, views = now, at_lit
     if charted.charts:
         targets = charted.targets
         masks = replace(masks, selection=charted.selection, views=targets.views)

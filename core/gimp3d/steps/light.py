@@ -12,6 +12,8 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..result import RemovalResult
+from ..stages.charts import Chart
+from ..stages.contact import find_contact
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from ..stages.masks import Masks
@@ -94,6 +96,28 @@ def undo_light(scene: Gaussians, masks: Masks, surfaces: Surfaces, views: Sequen
         return first
     lifted = lift_shadow(scene, masks.removed, found.shadow, witnesses)
     return lifted if first is None else lifted.after(first)
+
+
+def with_contact(found: Found, charts: Sequence[Chart]) -> Found:
+    """The same with the shadow where the object touches a surface: where none of a lamp was found."""
+    shadow = find_contact(charts)
+    if isinstance(shadow, str):
+        return replace(found, why_shadow=f"{found.why_shadow}; {shadow}")
+    return replace(found, shadow=shadow, why_shadow=shadow.reason)
+
+
+def lift_contact(
+    scene: Gaussians,
+    masks: Masks,
+    surfaces: Surfaces,
+    views: Sequence[ViewState],
+    found: Found,
+    before: Lifted | None,  # the reflection undone, in the same scene and views
+) -> Lifted:
+    """Lift the shadow where the object touches a surface."""
+    assert found.shadow is not None
+    lifted = lift_shadow(scene, masks.removed, found.shadow, surfaces.witnesses(views))
+    return lifted if before is None else lifted.after(before)
 
 
 @dataclass(frozen=True)
