@@ -118,7 +118,11 @@ def known_light(made: LitScene, folder: Path) -> list[str]:
     wall, _ = timed(lambda: results.append(remove_object(made.gaussians, views, made.region, PRESETS["draft"])))
     result, final = results[0], filled(made.gaussians, results[0])
     towards = [np.array(x["direction"]) for x in result.shadow["lights"]]
-    off = [min([angle(lamp.direction, t) for t in towards], default=180.0) for lamp in made.lamps]
+    off = [
+        min([angle(lamp.direction, t) for t in towards], default=180.0)
+        for lamp in made.lamps
+        if np.isfinite(lamp.softness)
+    ]
     before, after, rows = [], [], []
     for view in views[::3]:
         truth, drawn = render_bytes(made.truth, view.camera), render_bytes(final, view.camera)

@@ -23,6 +23,7 @@ from gimp3d.srgb import decoded, encoded
 
 STEP = 0.025  # between splats
 RAYS = 64  # to a soft light
+SKY = 256  # and to all sides
 WALL = 0.7  # x of the wall beside the block
 SIDE = 1.6  # half of the floor's
 DIFFERS = 8  # grey levels by which a reflection is seen
@@ -34,7 +35,7 @@ class Lamp:
 
     elevation: float  # degrees
     azimuth: float
-    softness: float  # degrees, σ
+    softness: float  # degrees, σ; infinite: light from all sides, as in a room
     strength: float = 0.6  # share of a surface's light
 
     @property
@@ -43,7 +44,10 @@ class Lamp:
         return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 
     def rays(self) -> np.ndarray:
-        """[RAYS, 3] directions of the lobe, at random but always the same."""
+        """[N, 3] directions of the lobe, at random but always the same; of the whole sky if it is endlessly soft."""
+        if math.isinf(self.softness):
+            a, b = np.random.default_rng(0).random((2, SKY))
+            return np.stack([np.sqrt(a) * np.cos(2 * np.pi * b), np.sqrt(a) * np.sin(2 * np.pi * b), np.sqrt(1 - a)], 1)
         spread = np.random.default_rng(0).normal(size=(RAYS, 3)) * math.radians(self.softness)
         rays = self.direction + spread
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -210,12 +214,13 @@ def cube(box: Box, colour: tuple[float, float, float]) -> Gaussians:
 
 
 def shadowed_scenes() -> Iterator[LitScene]:
-    """Suns of five heights, hard and soft, on several grounds; two lights; a hill; a wall; a neighbour."""
+    """Suns of five heights, hard and soft, on several grounds; a room's light; two lights; a hill; a wall; a neighbour."""
     paints = (floor_colours, grain, tiles, plain, floor_colours)
     for k, elevation in enumerate((20, 32, 45, 58, 70)):
         for softness in (1.0, 8.0):
             lamp = Lamp(elevation, 40 + 67 * k, softness)
             yield make_scene(f"sun {elevation} {'hard' if softness < 2 else 'soft'}", [lamp], paints[k])
+    yield make_scene("room", [Lamp(90, 0, math.inf, 0.9)], tiles)
     yield make_scene("two lights", [Lamp(40, 20, 3, 0.45), Lamp(50, 160, 3, 0.35)], grain)
     yield make_scene("hill", [Lamp(40, 110, 3)], floor_colours, bent)
     yield make_scene("wall", [Lamp(30, 180, 4)], floor_colours, wall=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from . import pictures
+from .behind import Behind, look_behind
 from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
@@ -21,21 +22,17 @@ from .progress import Progress, silent
 from .raster import render_bytes
 from .result import Picture, RemovalResult, StageReport, View
 from .run import Observer, Run, Store, unobserved
-from .stages.charts import Chart
-from .stages.exposure import exposures_of
 from .stages.masks import Masks, find_masks
 from .stages.propagate import Reference
 from .stages.verdict import Verdict, judge
 from .steps.completion import charts_to_paint, complete_view_depth, turns_of
-from .steps.light import NOT_LIT, Relit, find_light, lift_contact, undo_light, with_contact
-from .steps.surfaces import chart_surfaces, find_surfaces
+from .steps.light import NOT_LIT, Relit
 from .view_state import ViewState, open_pixels
 
 __all__ = [
     "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look_behind", "preview",
     "provider_notices", "remove_object", "render_bytes",
 ]  # fmt: skip
-BEFORE_FILL = ("masks", "exposure", "surfaces", "light", "lift", "charts")  # stages that know nothing of fills
 REFINERS = ("command", "http", "https")  # who may be asked to refine views
 
 
@@ -207,59 +204,6 @@ def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> 
             raise BadInput(f"--refine-views: unknown provider {settings.refine_views!r}; use http://… or command:CMD")
         notices.append(painter(settings.refine_views, run.call("--refine-views", "read")).notice)
     return [notice for notice in notices if notice]
-
-
-@dataclass(frozen=True)
-class Behind:
-    """What is behind the object, and the scene in the light that it would have without it."""
-
-    scene: Gaussians
-    masks: Masks  # with what had to be cleared away; if there are charts, T is what no photo shows of them
-    views: tuple[ViewState, ...]
-    charts: tuple[Chart, ...]
-    lit: Relit
-
-
-def look_behind(
-    run: Run,
-    scene: Gaussians,
-    region: Region,
-    masks: Masks,
-    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
-    shadow_masks: Mapping[str, np.ndarray],
-) -> Behind:
-    """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
-    settings, region, lit = run.settings, masks.grown(region), NOT_LIT
-    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos)
-    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views))
-    if settings.charts is None or masks.mode != "need":
-        return Behind(scene, masks, views, (), lit)
-    surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
-    found = None
-    if settings.shadow != "off":
-        found = run("light", find_light, scene, region, masks, surfaces, views, shadow_masks, settings)
-        if found.shadow is None and settings.shadow == "mask":
-            run.warnings.append(found.why_shadow)
-        lit = Relit.of(found, run("lift", undo_light, scene, masks, surfaces, views, found) if found.anything else None)
-    now, at_lit = lit.scene(scene), lit.views(views)
-    at_surfaces = surfaces if lit.lifted is None else surfaces.with_marked(lit.lifted.dark)
-    charted = run("charts", chart_surfaces, now, region, masks, at_surfaces, at_lit, settings)
-    if found is not None and found.shadow is None and settings.shadow == "auto":
-        contact = run("contact", with_contact, found, charted.charts)
-        if contact.shadow is not None:
-            lifted = run("lift contact", lift_contact, now, masks, at_surfaces, at_lit, contact, lit.lifted)
-            lit = Relit.of(contact, lifted)
-            at_surfaces = surfaces.with_marked(lifted.dark)
-            now, at_lit = lit.scene(scene), lit.views(views)
-            charted = run("charts without contact", chart_surfaces, now, region, masks, at_surfaces, at_lit, settings)
-        lit = Relit.of(contact, lit.lifted)
-    run.pictures += pictures.of_light(lit, [v.id for v in views])
-    scene, views = now, at_lit
-    if charted.charts:
-        targets = charted.targets
-        masks = replace(masks, selection=charted.selection, views=targets.views)
-        views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
-    return Behind(scene, masks, views, charted.charts, lit)
 
 
 def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from gimp3d.frame import Frame
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 
-IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "appearance", "seed", "propagate", "settle"]
+IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "contact", "appearance", "seed", "propagate", "settle"]
 
 
 def views() -> list[View]:

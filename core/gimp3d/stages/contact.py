@@ -17,6 +17,7 @@ from ..geometry import dilated
 from ..srgb import linear
 from .charts import Chart
 from .ground import Ground
+from .lifting import MIXED
 from .light_search import DARK
 from .shadow import Shadow
 
@@ -27,6 +28,7 @@ LIKE = 0.3  # log of a ratio of channels by which a surface's colours differ as 
 COMPARED = 15  # texels of like colour with which one is compared
 VISIBLE = 0.1  # of log luminance, below which nobody sees a rim
 CHANCE = 3.0  # times as much of the outline must be dark as farther out, where nothing touches anything
+TOO_DARK = 1.01 - MIXED  # share of light; what only pixels show that may be the object's, in its shadow, is filled
 SOME = 0.05  # share of the outline that chance makes dark at least
 
 
@@ -101,7 +103,7 @@ def _mostly_dark(
     limit: float,
     width: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W] bool: parts of a strip most of whose surroundings along it are darker; and their mean change."""
+    """[H, W] bool: parts of a strip most of whose surroundings along it are darker; and by how much."""
     side = (2 * round(width) + 1,) * 2
 
     def along(values: np.ndarray) -> np.ndarray:
@@ -109,15 +111,14 @@ def _mostly_dark(
 
     count = along(strip)
     dark = strip & (along(strip & (change < -limit)) > 0.5 * count)
-    mean = along(np.where(strip, np.minimum(change, 0), 0)) / np.maximum(count, 1)
-    return dark, mean
+    shaded = strip & (change < -limit)
+    return dark, along(np.where(shaded, change, 0)) / np.maximum(along(shaded), 1)
 
 
 def _taken(level: np.ndarray, hole: np.ndarray, width: float) -> np.ndarray:
-    """[H, W] the share of light taken: without steps, and in the hole as beside it."""
+    """[H, W] the share of light taken: without steps, and beside the object so much that it is filled."""
     dark = level < 0
-    if not dark.any():
-        return np.zeros(level.shape)
-    rows, cols = scipy.ndimage.distance_transform_edt(~dark, return_distances=False, return_indices=True)
-    whole = np.where(hole & dilated(dark, round(width)), level[rows, cols], level)
-    return np.maximum(1 - np.exp(cv2.GaussianBlur(whole, (0, 0), width / (2 * STRIPS))), 0)
+    taken = 1 - np.exp(cv2.GaussianBlur(level, (0, 0), width / (2 * STRIPS)))
+    inside = hole & dilated(dark, round(width))
+    taken[inside] = np.maximum(taken[inside], TOO_DARK)
+    return taken

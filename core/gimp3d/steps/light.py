@@ -106,20 +106,6 @@ def with_contact(found: Found, charts: Sequence[Chart]) -> Found:
     return replace(found, shadow=shadow, why_shadow=shadow.reason)
 
 
-def lift_contact(
-    scene: Gaussians,
-    masks: Masks,
-    surfaces: Surfaces,
-    views: Sequence[ViewState],
-    found: Found,
-    before: Lifted | None,  # the reflection undone, in the same scene and views
-) -> Lifted:
-    """Lift the shadow where the object touches a surface."""
-    assert found.shadow is not None
-    lifted = lift_shadow(scene, masks.removed, found.shadow, surfaces.witnesses(views))
-    return lifted if before is None else lifted.after(before)
-
-
 @dataclass(frozen=True)
 class Relit:
     """What the object does to the light round it undone, or why it is not."""

@@ -77,6 +77,15 @@ def test_the_light_is_found_and_its_shadow_goes(name: str) -> None:
     assert before < -0.3 and abs(after) < 0.2 * abs(before)
 
 
+@pytest.mark.parametrize("paint", [plain, pytest.param(tiles, marks=pytest.mark.slow)])
+def test_the_shade_of_a_room_goes_though_no_lamp_casts_it(paint) -> None:  # type: ignore[no-untyped-def]
+    scene = make_scene("room", [Lamp(90, 0, np.inf, 0.9)], paint)
+    result = removed(scene)
+    assert result.shadow["found"], result.shadow["reason"]
+    before, after = darkening(scene, result)
+    assert before < -0.14 and abs(after) < 0.4 * abs(before), (before, after)
+
+
 @pytest.mark.parametrize(
     "paint", [*(pytest.param(p, marks=pytest.mark.slow) for p in (plain, floor_colours, tiles)), rug, stain]
 )

@@ -1,0 +1,77 @@
+"""What is behind the object: its surfaces in the light that they would have without it, and where they are unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from . import pictures
+from .box import Region
+from .gaussians import Gaussians
+from .run import Run
+from .stages.charts import Chart
+from .stages.exposure import exposures_of
+from .stages.masks import Masks
+from .steps.light import NOT_LIT, Found, Relit, find_light, undo_light, with_contact
+from .steps.surfaces import Charted, chart_surfaces, find_surfaces
+from .view_state import ViewState
+
+# Stages that know nothing of fills.
+BEFORE_FILL = ("masks", "exposure", "surfaces", "light", "lift", "charts", "contact", "lift 2", "charts 2")
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What is behind the object, and the scene in the light that it would have without it."""
+
+    scene: Gaussians
+    masks: Masks  # with what had to be cleared away; if there are charts, T is what no photo shows of them
+    views: tuple[ViewState, ...]
+    charts: tuple[Chart, ...]
+    lit: Relit
+
+
+def look_behind(
+    run: Run,
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
+    shadow_masks: Mapping[str, np.ndarray],
+) -> Behind:
+    """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
+    settings, region, lit = run.settings, masks.grown(region), NOT_LIT
+    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos)
+    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views))
+    if settings.charts is None or masks.mode != "need":
+        return Behind(scene, masks, views, (), lit)
+    surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
+
+    def in_light(found: Found | None, suffix: str = "") -> tuple[Relit, Charted]:
+        """What the object does to the light undone, and the charts as they are then."""
+        light = None
+        if found is not None and found.anything:
+            light = run(f"lift{suffix}", undo_light, scene, masks, surfaces, views, found)
+        lit = NOT_LIT if found is None else Relit.of(found, light)
+        bounded = surfaces if light is None else surfaces.with_marked(light.dark)
+        inputs = lit.scene(scene), region, masks, bounded, lit.views(views), settings
+        return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
+
+    found = None
+    if settings.shadow != "off":
+        found = run("light", find_light, scene, region, masks, surfaces, views, shadow_masks, settings)
+        if found.shadow is None and settings.shadow == "mask":
+            run.warnings.append(found.why_shadow)
+    lit, charted = in_light(found)
+    if found is not None and found.shadow is None and settings.shadow == "auto":
+        found = run("contact", with_contact, found, charted.charts)
+        lit, charted = in_light(found, " 2") if found.shadow is not None else (Relit.of(found, lit.lifted), charted)
+    run.pictures += pictures.of_light(lit, [v.id for v in views])
+    scene, views = lit.scene(scene), lit.views(views)
+    if charted.charts:
+        targets = charted.targets
+        masks = replace(masks, selection=charted.selection, views=targets.views)
+        views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
+    return Behind(scene, masks, views, charted.charts, lit)
