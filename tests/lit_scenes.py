@@ -214,7 +214,7 @@ def cube(box: Box, colour: tuple[float, float, float]) -> Gaussians:
 
 
 def shadowed_scenes() -> Iterator[LitScene]:
-    """Suns of five heights, hard and soft, on several grounds; a room's light; two lights; a hill; a wall; a neighbour."""
+    """Suns of five heights, hard and soft, on several grounds; a room; two lights; a hill; a wall; a neighbour."""
     paints = (floor_colours, grain, tiles, plain, floor_colours)
     for k, elevation in enumerate((20, 32, 45, 58, 70)):
         for softness in (1.0, 8.0):
