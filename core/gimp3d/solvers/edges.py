@@ -40,6 +40,7 @@ class Edge:
     origin: np.ndarray  # [2] (x, y) px, where the hole's middle is nearest
     along: np.ndarray  # [2] unit
     ends: tuple[float, float]  # px along it, between which it is seen or runs through the hole
+    step: np.ndarray  # [3] grey levels by which colours change across it, from left to right of `along`
 
 
 def find_edges(
@@ -184,7 +185,8 @@ def _settled(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: fl
             steady = steady and _is_edge(near)
             ends.append(float(t[_length(sums, _step(near))]))
         told = float(_told(sides, 2 * LEAST)[0])
-        return told, Edge(origin, along, (ends[0], ends[1])) if steady else None
+        means = [[s[0, 1:4] / max(s[0, 0], 1) for s in pair] for pair in sides]
+        return told, Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1))) if steady else None
 
     values, step = np.zeros(2), 1.0
     best = at(values)
@@ -238,13 +240,13 @@ def guide_of(
     shrunk: float,  # times, the picture that the edges were found in
     width: float,  # px, σ
 ) -> np.ndarray:
-    """[h, w, 2] float32 in [-1, 1]: how near to an edge a pixel lies, and on which side of it.
+    """[h, w, 5] float32 in [-1, 1]: how near to an edge a pixel lies, on which side of it, and the edge's step.
 
-    Two pixels of the same guide lie at the same distance from an edge; it is 0 far from one and beyond its ends.
+    Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one and beyond its ends.
     """
     h, w = shape
     x, y = (np.arange(n, dtype=np.float32) for n in (w, h))
-    guide, nearest = np.zeros((h, w, 2), np.float32), np.full((h, w), np.inf, np.float32)
+    guide, nearest = np.zeros((h, w, 5), np.float32), np.full((h, w), np.inf, np.float32)
     for edge in edges:
         origin = (edge.origin + 0.5) / shrunk - 0.5
         dx, dy = x[None] - np.float32(origin[0]), y[:, None] - np.float32(origin[1])
@@ -253,6 +255,7 @@ def guide_of(
         there = (along >= edge.ends[0] / shrunk) & (along <= edge.ends[1] / shrunk)
         closer = there & (np.abs(off) < nearest)
         fades = np.exp(-0.5 * off**2)
-        guide[closer] = np.stack([fades, off * fades * np.float32(math.exp(0.5))], -1)[closer]
+        step = fades[..., None] * np.float32(edge.step / 255)
+        guide[closer] = np.dstack([fades, off * fades * np.float32(math.exp(0.5)), step])[closer]
         nearest[closer] = np.abs(off)[closer]
     return guide
