@@ -242,7 +242,7 @@ def guide_of(
 ) -> np.ndarray:
     """[h, w, 5] float32 in [-1, 1]: how near to an edge a pixel lies, on which side of it, and the edge's step.
 
-    Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one and beyond its ends.
+    Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one, and past its ends.
     """
     h, w = shape
     x, y = (np.arange(n, dtype=np.float32) for n in (w, h))
