@@ -49,7 +49,6 @@ from .stages.masks import MaskSettings, find_masks
 from .steps.completion import charts_to_paint
 from .steps.light import NOT_LIT
 from .store import SharedStages, StageStore
-from .stored import STORED
 from .summary import summary_of, variant_facts
 from .view_state import ViewState
 
@@ -334,7 +333,7 @@ def run_removal(
         of_variant = replace(settings, variant=variant)
         if folder:
             stages = folder / "stages" / (str(variant + 1) if variant else "")
-            shared.own = StageStore(stages, key, STORED, resume, asdict(of_variant))
+            shared.own = StageStore(stages, key, resume, asdict(of_variant))
         result = remove_object(
             scene,
             views,

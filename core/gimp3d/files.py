@@ -50,11 +50,7 @@ def require_file(path: Path) -> Path:
     BadInput
         If it is a pipe, a socket or a device.
     """
-    try:
-        kind = path.stat().st_mode
-    except (OSError, ValueError):  # whoever opens it says why it cannot be read
-        return path
-    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+    if is_stream(path):
         raise BadInput(f"{path} is a pipe or a device; a file is needed, as it is read more than once")
     return path
 
@@ -71,8 +67,8 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     """
     try:
         if is_stream(path):
-            with path.open("wb", buffering=0) as stream:
-                write(_Whole(stream))  # type: ignore[arg-type]
+            with path.open("wb") as stream:
+                write(stream)
             return
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -132,11 +128,10 @@ def sweep(folders: Iterable[Path]) -> None:
 
 def is_stream(path: Path) -> bool:
     """A pipe, a socket or a device, which is written to and never replaced."""
-    try:
-        kind = os.stat(path).st_mode
-    except OSError:
-        return False
-    return not stat.S_ISREG(kind) and not stat.S_ISDIR(kind)
+    with suppress(OSError, ValueError):  # whoever opens it says why it cannot be read
+        kind = path.stat().st_mode
+        return not stat.S_ISREG(kind) and not stat.S_ISDIR(kind)
+    return False
 
 
 def identity(path: Path) -> tuple[int, ...] | None:
@@ -146,30 +141,6 @@ def identity(path: Path) -> tuple[int, ...] | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
-
-
-class _Whole:
-    """A stream without buffer that takes every byte, and no seeking."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream, self._at = stream, 0
-
-    def write(self, data: Any) -> int:
-        rest = memoryview(data).cast("B")
-        size = len(rest)
-        while len(rest):
-            rest = rest[self._stream.write(rest) :]
-        self._at += size
-        return size
-
-    def flush(self) -> None:
-        pass
-
-    def tell(self) -> int:
-        return self._at
-
-    def read(self, *_: Any) -> bytes:
-        raise OSError("a stream is written only")
 
 
 def _take_permissions(name: str, target: Path) -> None:

@@ -30,7 +30,7 @@ sys.path[:0] = [str(TESTS), str(TESTS / "core" / "io")]
 from onnx_files import model, pixelwise
 from test_formats import WRITERS, sog_files, some
 
-from gimp3d.box import Box, read_region
+from gimp3d.box import read_region
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.io.cameras import camera_id, read_cameras
@@ -260,9 +260,7 @@ def onnx_seed() -> list[bytes]:
 
 
 def stage_seed(path: Path) -> None:
-    StageStore(path.parent, "key", (Camera, Box), True).save(
-        path.name, (np.arange(6.0), Camera("a", 4, 3, 5, 5, 2, 1, np.eye(4)))
-    )
+    StageStore(path.parent, "key", True).save(path.name, (np.arange(6.0), Camera("a", 4, 3, 5, 5, 2, 1, np.eye(4))))
     path.with_suffix(".npz").rename(path)
 
 
@@ -303,7 +301,7 @@ READERS = {
         Reader("colmap txt", read_colmap("txt"), lambda: [SEPARATOR.join(COLMAP_TEXTS)]),
         Reader("roi", in_file("r.json", read_region), dumped(BOX, [BOX, BOX]), True),
         Reader("job", in_file("job.json", lambda p: load_job(p.parent)), file_seeds(job_seed), True),
-        Reader("stage", in_file("stage.npz", lambda p: StageStore(p.parent, "key", (Camera, Box), True).load("stage")),
+        Reader("stage", in_file("stage.npz", lambda p: StageStore(p.parent, "key", True).load("stage")),
                file_seeds(stage_seed)),
         Reader("photo png", in_file("p.png", read_photo), picture(".png")),
         Reader("photo png inside", lambda d: in_file("p.png", read_photo)(with_checksums(d)), picture(".png")),
