@@ -30,15 +30,7 @@ from .job import MOST_VARIANTS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
-from .pipeline import (
-    RemovalResult,
-    RemovalSettings,
-    View,
-    look_behind,
-    preview,
-    remove_object,
-    render_bytes,
-)
+from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
@@ -328,25 +320,14 @@ def run_removal(
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     key = _job_key(job, views, (extra, shadow)) if folder else ""
     shared = SharedStages(BEFORE_FILL if job.variants > 1 else ())
+    inputs, reference = (scene, views, frame.region(region)), _clean_id(job.reference)
     results: list[RemovalResult] = []
     for variant in range(settings.variant, settings.variant + job.variants):
         of_variant = replace(settings, variant=variant)
         if folder:
             stages = folder / "stages" / (str(variant + 1) if variant else "")
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
-        result = remove_object(
-            scene,
-            views,
-            frame.region(region),
-            of_variant,
-            _clean_id(job.reference),
-            given,
-            progress,
-            shared,
-            extra,
-            shadow,
-            allow_network,
-        )
+        result = remove_object(*inputs, of_variant, reference, given, progress, shared, extra, shadow, allow_network)
         charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
         results.append(replace(result, charts=charts, proposed=proposed))
     summary = summary_of(job, settings, file, results[0], warnings, time.perf_counter() - start)
@@ -449,9 +430,8 @@ def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str
     digest = hashlib.sha256(__version__.encode())
     free = ("out", "views_out", "report", "summary", "threads", "device", "variants")
     files = ("scene", "cameras", "roi", "reference_image")
-    settings = {
-        k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks", "shadow_masks")
-    }
+    folders = ("images", "extra_masks", "shadow_masks")
+    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, *folders)}
     digest.update(json.dumps(settings, sort_keys=True).encode())
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import atexit
 import gzip
+import io
 import json
 import math
 import os
@@ -161,7 +162,7 @@ def colmap_seeds() -> list[bytes]:
 def read_sog(data: bytes) -> object:
     """A description alone, with good pictures."""
     files = sog_seed()
-    return _from_sog(lambda name, most: data[:most] if name == "meta.json" else files[name][:most], Path("x.sog"))
+    return _from_sog(lambda name: io.BytesIO(data if name == "meta.json" else files[name]), Path("x.sog"))
 
 
 @cache
@@ -182,7 +183,7 @@ def sog_descriptions() -> list[bytes]:
 def read_sog_parts(data: bytes) -> object:
     """All of a SOG's files, as no archive's checksums guard them."""
     files = dict(zip(sog_seed(), data.split(SEPARATOR)))
-    return _from_sog(lambda name, most: files[name][:most], Path("x.sog"))
+    return _from_sog(lambda name: io.BytesIO(files[name]), Path("x.sog"))
 
 
 def spz_inside(name: str) -> Reader:

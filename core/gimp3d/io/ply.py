@@ -118,10 +118,7 @@ def write_ply(
     if keep.shape != (len(file.table.rows),) or keep.dtype != bool:
         raise ValueError(f"keep: {len(file.table.rows)} bools expected, got {keep.dtype} {keep.shape}")
     table, count = file.table, int(np.count_nonzero(keep)) + (len(added) if added is not None else 0)
-    lines = [
-        re.sub(r"^(element vertex) \d+$", rf"\1 {count}", " ".join(h.split())) if _counts(h) else h
-        for h in table.header
-    ]
+    lines = [f"element vertex {count}" if h.split()[:2] == ["element", "vertex"] else h for h in table.header]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
     kept = table.rows if np.all(keep) else table.rows[np.asarray(keep, dtype=bool)]
     new = None
@@ -395,7 +392,3 @@ def ascii_rows(records: np.ndarray) -> list[bytes]:
 
 def _text(value: np.generic) -> str:
     return np.format_float_positional(value, trim="-") if isinstance(value, np.floating) else str(value)
-
-
-def _counts(line: str) -> bool:
-    return line.split()[:2] == ["element", "vertex"]
