@@ -184,11 +184,7 @@ def splu(given: Problem) -> Solution:
     return factor.solve(given.right), None
 
 
-SOLVERS: dict[str, Callable[[Problem, float], Solution]] = {
-    OURS: ours,
-    "pyamg RS + CG": pyamg_cg,
-    "SciPy CG": scipy_cg,
-}
+SOLVERS: dict[str, Callable[[Problem, float], Solution]] = {OURS: ours, "pyamg RS + CG": pyamg_cg, "SciPy CG": scipy_cg}
 
 
 # ------------------------------------------------------------------------------------------------------------ measured

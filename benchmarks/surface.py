@@ -157,10 +157,7 @@ def shadow(name: str, results: Row, unperturbed: dict[str, dict[str, np.ndarray]
 
 
 def scene_masks(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    settings: MaskSettings = MaskSettings(),
-    region: Region | None = None,
+    scene: Scene, cameras: Sequence[Camera], settings: MaskSettings = MaskSettings(), region: Region | None = None
 ) -> Masks:
     """The stage as a removal calls it."""
     return find_masks(scene.gaussians, region or scene.region, cameras, settings, photos=scene.photos)

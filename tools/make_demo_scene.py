@@ -153,10 +153,7 @@ def ball(
 
 
 def cuboid(
-    centre: tuple[float, float, float],
-    size: tuple[float, float, float],
-    turn: float,
-    colour: tuple[float, ...],
+    centre: tuple[float, float, float], size: tuple[float, float, float], turn: float, colour: tuple[float, ...]
 ) -> Gaussians:
     """A book: five faces, pages on the long side."""
     c, s = math.cos(turn), math.sin(turn)

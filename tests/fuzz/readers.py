@@ -42,7 +42,7 @@ from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d.priors import servers
 from gimp3d.priors.monodepth import _from_file
 from gimp3d.priors.onnx import read_model
-from gimp3d.priors.servers import _Asked, _Automatic, _Comfy, _said, _Server, _workflow
+from gimp3d.priors.servers import _Automatic, _Comfy, _said, _Server, _workflow
 from gimp3d.schema import checked, parse_json
 from gimp3d.settings import job_settings
 from gimp3d.store import StageStore
@@ -225,7 +225,7 @@ class Answers(_Server):
         self.option, self.url, self.seconds = "x", "http://localhost:1", 1.0
         self.document, self.left = document, 9
 
-    def _ask(self, path: str, *_: Any) -> bytes:
+    def ask(self, path: str, *_: Any, **__: Any) -> bytes:
         self.left -= 1
         if not self.left:
             raise BadInput("asked too often")
@@ -239,10 +239,9 @@ def read_answers(data: bytes) -> object:
     if "error" in document:
         return _said(data)
     values = {"prompt": "", "negative": "", "seed": 0, "strength": 1, "checkpoint": ""}
-    asked = _Asked(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
     painting = _Comfy(Answers(document), None) if document.pop("comfy", False) else _Automatic(Answers(document))
     painting.words()
-    return painting.paint(asked)
+    return painting.paint(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
 
 
 def read_depth(name: str) -> Callable[[bytes], object]:
