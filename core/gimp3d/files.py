@@ -72,13 +72,15 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
             return
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(f".{os.getpid()}{UNFINISHED}", f".{_short(target.name)}.", target.parent)
+        name = target.with_name(f".{_short(target.name)}.{secrets.token_hex(4)}.{os.getpid()}{UNFINISHED}")
+        old = target.stat() if target.exists() else None
         try:
-            with os.fdopen(handle, "wb") as file:
+            with open(name, "xb", opener=lambda n, flags: os.open(n, flags, 0o600 if old else 0o666)) as file:
                 write(file)
                 file.flush()
                 os.fsync(file.fileno())
-            _take_permissions(name, target)
+            if old:
+                _take_permissions(name, old)
             os.replace(name, target)
         except BaseException:
             with suppress(OSError):
@@ -143,17 +145,12 @@ def identity(path: Path) -> tuple[int, ...] | None:
     return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
 
 
-def _take_permissions(name: str, target: Path) -> None:
+def _take_permissions(path: Path, old: os.stat_result) -> None:
     """A new file gets the permissions, and where that is allowed the owner, of the one that it replaces."""
-    try:
-        old = target.stat()
-    except OSError:
-        os.chmod(name, 0o666 & ~_umask())
-        return
     if hasattr(os, "chown"):
         with suppress(OSError):
-            os.chown(name, old.st_uid, old.st_gid)
-    os.chmod(name, stat.S_IMODE(old.st_mode))
+            os.chown(path, old.st_uid, old.st_gid)
+    path.chmod(stat.S_IMODE(old.st_mode))
 
 
 def _short(name: str) -> str:
@@ -171,9 +168,3 @@ def _alive(process: int) -> bool:
     except OSError:
         return True
     return process != os.getpid()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
