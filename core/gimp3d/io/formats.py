@@ -85,16 +85,13 @@ def _from_compressed_ply(path: Path) -> Gaussians:
     """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
     header, data = header_of(path), path.read_bytes()
     tables, offset = {}, header.size
-    for element in header.elements:
-        try:
-            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
-        except ValueError as error:  # two properties of one name
-            raise BadInput(f"{path}: a damaged compressed PLY ({error})") from None
-        if offset + element.count * kind.itemsize > len(data):
-            raise BadInput(f"{path} is truncated: element {element.name} is not whole")
-        tables[element.name] = np.frombuffer(data, kind, element.count, offset)
-        offset += element.count * kind.itemsize
     try:
+        for element in header.elements:
+            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+            if offset + element.count * kind.itemsize > len(data):
+                raise BadInput(f"{path} is truncated: element {element.name} is not whole")
+            tables[element.name] = np.frombuffer(data, kind, element.count, offset)
+            offset += element.count * kind.itemsize
         vertex, bounds = tables["vertex"], tables["chunk"]
         if len(bounds) * CHUNK_ROWS < len(vertex):
             raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
