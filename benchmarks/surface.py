@@ -354,9 +354,8 @@ def panel(heading: str, measure: str, labels: Sequence[str], lines: Lines, joine
     for n, (name, line) in enumerate(lines.items()):
         dark, shift = name.endswith(SHADOW), 0.0 if joined else 0.07 * (n - (len(lines) - 1) / 2)
         points = [(x + shift, unit * r[measure]) for x, r in line]
-        drawn.append(Line(name, points, name.removesuffix(SHADOW), "--" if dark else "-", hollow=dark))
-        if not joined:
-            drawn[-1] = Line(name, points, name.removesuffix(SHADOW), "none", hollow=dark)
+        style = "none" if not joined else "--" if dark else "-"
+        drawn.append(Line(name, points, name.removesuffix(SHADOW), style, hollow=dark))
     ticks = {float(k): label for k, label in enumerate(labels)}
     return Panel(heading, drawn, "", words, False, logarithmic, ticks, wanted, named=False)
 
