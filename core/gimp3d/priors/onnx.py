@@ -102,14 +102,11 @@ class OnnxModel:
         feeds = {name: np.ascontiguousarray(blob, np.float32) for name, blob in blobs.items()}
         runtime = onnx_runtime()
         who = "OpenCV" if runtime is None else "ONNX Runtime"
+        failures = cv2.error if runtime is None else Exception  # ONNX Runtime's have no common base
         try:
             return self._by_opencv(feeds) if runtime is None else self._by_runtime(runtime, feeds)
-        except cv2.error as error:
-            reason = error.err or str(error)
-        except Exception as error:  # ONNX Runtime's have no common base
-            if runtime is None:
-                raise
-            reason = str(error)
+        except failures as error:
+            reason = getattr(error, "err", None) or str(error)
         advice = "export it to a plain ONNX" if runtime else "install onnxruntime, or export it to a plain ONNX"
         raise BadInput(f"{self.who}: {who} cannot run it ({one_line(reason, 200)}); {advice}")
 
