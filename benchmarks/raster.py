@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,12 +25,13 @@ from gimp3d.camera import Camera
 from gimp3d.compute.simd import fma16, splat16, store16
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.gaussians import Gaussians
+from gimp3d.memory import peak_memory_mb
 from gimp3d.raster import PictureGradients, backward, contributions, cpu, pixel_region, trace
 
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .plots import Line, Panel, draw_panels
 from .tables import Row, Section, columns, in_words, markdown, shown, values, where
-from .timing import Watch, about, best_of, cost, in_new_process, machine, peak_mib, replaced
+from .timing import Watch, about, best_of, cost, in_new_process, machine, replaced, timed
 
 PASSES = frozenset({"rgb", "alpha", "expected_depth"})
 SEED = 0
@@ -154,12 +155,12 @@ def tile_phases() -> Iterator[list[tuple[float, float]]]:
     """What the work on tiles alone costs: blending, and the way back through it."""
     over_tiles, laps = cpu.over_tiles, []
 
-    def timed(*args: Any) -> None:
+    def watched(*args: Any) -> None:
         watch = Watch()
         over_tiles(*args)
         laps.append(watch.lap())
 
-    with replaced(cpu, "over_tiles", timed):
+    with replaced(cpu, "over_tiles", watched):
         yield laps
 
 
@@ -227,16 +228,11 @@ def peak_gflops() -> float:
     out, turns = np.empty(LANES, np.float32), 4_000_000
     best = 0.0
     for kernel, chains in ((five_chains, 5), (ten_chains, 10)):
-        kernel(1, np.float32(0.5), np.float32(1), out)
-        seconds = best_of(lambda k=kernel: timed_cpu(k, turns, out), 5)
-        best = max(best, 2 * LANES * chains * turns / float(seconds) / 1e9)
+        given = (np.float32(0.5), np.float32(1), out)
+        kernel(1, *given)  # compiles
+        _, cpu_ms = best_of(lambda k=kernel, g=given: timed(lambda: k(turns, *g)), 5)
+        best = max(best, 2 * LANES * chains * turns / cpu_ms / 1e6)
     return round(best, 2)
-
-
-def timed_cpu(kernel: Callable[..., None], turns: int, out: np.ndarray) -> float:
-    start = time.process_time()
-    kernel(turns, np.float32(0.5), np.float32(1), out)
-    return time.process_time() - start
 
 
 @numba.njit
@@ -363,11 +359,11 @@ def memory(count: int, size: Size) -> Row:
 def memory_peaks(count: int, size: Size) -> list[float]:
     warm_up()
     gaussians, view, gradients = scene(count), camera(size), picture_gradients(size)
-    peaks = [peak_mib()]
+    peaks = [round(peak_memory_mb(), 1)]
     _, traced = trace(gaussians, view, passes=PASSES)
-    peaks.append(peak_mib())
+    peaks.append(round(peak_memory_mb(), 1))
     _kept_until_read = backward(traced, gradients)
-    return [*peaks, peak_mib()]
+    return [*peaks, round(peak_memory_mb(), 1)]
 
 
 # ---------------------------------------------------------------------------------------------------- what is written
