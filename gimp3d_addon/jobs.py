@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import bpy
@@ -60,14 +61,11 @@ def jobs_folder() -> Path:
 def new_job_folder(name: str) -> Path:
     """A folder of its own, made now, so that another Blender takes another one."""
     clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "scene"
-    number = 1
-    while True:
+    for number in count(1):
         folder = jobs_folder() / f"{clean}-{number:03d}"
-        try:
+        with suppress(FileExistsError):
             folder.mkdir(parents=True)
             return folder
-        except FileExistsError:
-            number += 1
 
 
 def open_for(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> None:
