@@ -35,7 +35,7 @@ from .ablation import RULES, switched_off
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .photographs import OTHERS_PYTHON, REPETITIONS, SHARE, SLOW_S, blob, filled_by, photographs
 from .plots import COLOURS, FAINT, figure, name_ends
-from .tables import Row, Section, markdown, mean, values, where
+from .tables import Row, Section, columns, markdown, mean, sheet, values, where
 from .timing import about, machine
 
 OURS, RIVALS = "gimp3d exemplar", ("PyPatchMatch, radius 2", "PyPatchMatch, radius 3")
@@ -85,7 +85,7 @@ def fill_all(size: str, pictures: Pictures, given: Any, results: Row) -> None:
             results["pictures"].append(row)
         strips.append(strip(picture, hole, {m: f for m, (f, _) in fills.items()}))
         say(f"{size} {name} done")
-    write_png(given.out / f"sheet_{size}.png", np.vstack(strips))
+    write_png(given.out / f"sheet_{size}.png", sheet(strips))
 
 
 def completed(
@@ -128,17 +128,11 @@ def slope(picture: np.ndarray) -> np.ndarray:
     return np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1)).astype(np.float64)
 
 
-def strip(truth: np.ndarray, hole: np.ndarray, fills: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The hole and what was made of it, side by side; the truth last."""
+def strip(truth: np.ndarray, hole: np.ndarray, fills: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A row of a sheet: the hole, what was made of it, and the truth."""
     near = bounds(hole, SHEET_MARGIN)
     shown = {"hole": np.where(hole[..., None], np.uint8((255, 0, 255)), truth), **fills, "truth": truth}
-    cells = []
-    for name, picture in shown.items():
-        cell = cv2.resize(np.ascontiguousarray(picture[near]), CELL, interpolation=cv2.INTER_AREA)
-        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(cell, name, (5, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, width, cv2.LINE_AA)
-        cells.append(cell)
-    return np.hstack(cells)
+    return {n: cv2.resize(p[near], CELL, interpolation=cv2.INTER_AREA) for n, p in shown.items()}
 
 
 # -------------------------------------------------------------------------------------------------- what is written
@@ -157,29 +151,23 @@ def means(results: Row, size: str) -> dict[str, Row]:
     return found
 
 
-FORMS = {"s": "{:.2f}", "slower": "{:.1f}×", "psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}"}
-FORMS |= {"sharpness": "{:.2f}", "edge": "{:.2f}"}
+OF_METHODS = {"method": "{method}", "CPU, s": "{s:.2f}", "of ours": "{slower:.1f}×", "PSNR": "{psnr:.2f}"}
+OF_METHODS |= {"SSIM": "{ssim:.3f}", "FLIP": "{flip:.3f}", "sharpness": "{sharpness:.2f}"}
+OF_METHODS |= {"edges off, px": "{edge:.2f}"}
+OF_PICTURES = {"picture": "{picture}", "PSNR": "{psnr:.2f}", "edges off, px": "{edge:.2f}"}
+OF_PICTURES |= {"sharpness": "{sharpness:.2f}", "CPU, s": "{s:.2f}"}
 
 
 def sections(results: Row) -> Iterator[Section]:
     left_out = " ".join(f"Left out: {method} ({why})." for method, why in results["missing"].items())
-    head = ["method", "CPU, s", "of ours", "PSNR", "SSIM", "FLIP", "sharpness", "edges off, px"]
     for size in values(results["pictures"], "size"):
         rows = where(results["pictures"], size=size)
         names = values(rows, "picture")
-        yield Section(
-            f"{size}, {len(names)} pictures",
-            f"{', '.join(names)}. Means; photographs' holes are {SHARE:.0%}. Sharpness: mean slope over the truth's. "
-            + left_out,
-            head,
-            [
-                [method, *(form.format(m[key]) for key, form in FORMS.items())]
-                for method, m in means(results, size).items()
-            ],
-        )
-        keys = ("psnr", "edge", "sharpness", "s")
-        own = [[r["picture"], *(f"{r[k]:.2f}" for k in keys)] for r in where(rows, method=OURS)]
-        yield Section(f"{size}, {OURS}", "", ["picture", "PSNR", "edges off, px", "sharpness", "CPU, s"], own)
+        words = f"{', '.join(names)}. Means; photographs' holes are {SHARE:.0%}. "
+        words += f"Sharpness: mean slope over the truth's. {left_out}"
+        of_methods = ({"method": method, **m} for method, m in means(results, size).items())
+        yield Section(f"{size}, {len(names)} pictures", words, *columns(of_methods, OF_METHODS))
+        yield Section(f"{size}, {OURS}", "", *columns(where(rows, method=OURS), OF_PICTURES))
 
 
 def draw(results: Row, path: Path) -> None:

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
-from gimp3d.raster import Drawing, RasterSettings, Rendering, use_backend
+from gimp3d.raster import Drawing, Rendering, use_backend
 from gimp3d.raster.backend import Backend, current_backend
 from gimp3d.run import Observer
 from gimp3d.stages.depth import DepthCompletion
@@ -61,15 +61,8 @@ class NoisyDepths:
     def __init__(self, backend: Backend, relative: float, seed: int) -> None:
         self.backend, self.relative, self.seed = backend, relative, seed
 
-    def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        passes: frozenset[str],
-        pixels: np.ndarray | None,
-    ) -> Rendering:
-        drawn = self.backend.render(gaussians, camera, settings, passes, pixels)
+    def render(self, gaussians: Gaussians, camera: Camera, *options: Any) -> Rendering:
+        drawn = self.backend.render(gaussians, camera, *options)
         depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
         return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
 

@@ -18,26 +18,14 @@ from .command import write
 
 COLOURS = ("#1b7f5f", "#c65102", "#5e55a3", "#b0246b", "#59636e")  # dark on white, apart for colour-blind eyes
 INK, FAINT, GRID = "#1f2328", "#59636e", "#dfe3e8"
+NAMES = 8.5  # points of the names at lines' ends
 STYLE = {
-    "svg.hashsalt": "gimp3d",
-    "svg.fonttype": "none",  # words stay words
-    "font.family": "sans-serif",
-    "font.size": 9.5,
-    "text.color": INK,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.titlesize": 10,
-    "axes.edgecolor": FAINT,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "legend.frameon": False,
-    "lines.markersize": 4.5,
-}
+    "svg.hashsalt": "gimp3d", "svg.fonttype": "none",  # words stay words
+    "font.family": "sans-serif", "font.size": 9.5, "text.color": INK, "legend.frameon": False, "lines.markersize": 4.5,
+    "axes.titlelocation": "left", "axes.titleweight": "bold", "axes.titlesize": 10, "axes.edgecolor": FAINT,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True,
+    "grid.color": GRID, "xtick.color": FAINT, "ytick.color": FAINT,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -136,16 +124,16 @@ def draw_panel(ax: Axes, panel: Panel, colours: Mapping[str, str]) -> list[End]:
     return ends
 
 
-def name_ends(ax: Axes, ends: Sequence[End], size: float = 8.5) -> None:
+def name_ends(ax: Axes, ends: Sequence[End]) -> None:
     """Names to the right of the axes at their heights, moved apart where they would overlap."""
     ax.get_xlim(), ax.get_ylim()  # the limits are found when they are asked for
     height = ax.get_window_extent().height
-    step, lowest = 1.3 * size / max(height * 72 / ax.figure.dpi, 1), -np.inf
+    step, lowest = 1.3 * NAMES / max(height * 72 / ax.figure.dpi, 1), -np.inf
     for x, y, words, colour in sorted(ends, key=lambda end: end[1]):
         share = float(ax.transAxes.inverted().transform(ax.transData.transform((x, y)))[1])
         lowest = max(share, lowest + step)
         ax.annotate(
-            words, (x, y), (1.02, lowest), textcoords="axes fraction", color=colour, fontsize=size, va="center",
+            words, (x, y), (1.02, lowest), textcoords="axes fraction", color=colour, fontsize=NAMES, va="center",
             arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.25},
         )  # fmt: skip
 

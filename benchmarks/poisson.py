@@ -31,7 +31,7 @@ from gimp3d.solvers.poisson import PoissonSettings, solve_hole
 
 from .command import parser_of, say, told_in_one_line, write_results
 from .photographs import blob
-from .tables import Row, Section, markdown, where
+from .tables import Row, Section, columns, markdown, where
 from .timing import about, machine
 
 SIZES = {"480p": (480, 854), "1080p": (1080, 1920), "4K": (2160, 3840)}
@@ -184,11 +184,7 @@ def splu(given: Problem) -> Solution:
     return factor.solve(given.right), None
 
 
-SOLVERS: dict[str, Callable[[Problem, float], Solution]] = {
-    OURS: ours,
-    "pyamg RS + CG": pyamg_cg,
-    "SciPy CG": scipy_cg,
-}
+SOLVERS: dict[str, Callable[[Problem, float], Solution]] = {OURS: ours, "pyamg RS + CG": pyamg_cg, "SciPy CG": scipy_cg}
 
 
 # ------------------------------------------------------------------------------------------------------------ measured
@@ -231,7 +227,6 @@ def taking_turns(runs: dict[Any, Callable[[], Solution]]) -> tuple[dict[Any, flo
 def report(results: Row) -> str:
     by_tolerance = results["by_tolerance"]
     assembly = {r["size"]: f"{r['assembly_ms']:.0f} ms at {r['size']}" for r in by_tolerance}
-    head = ("hole", "share", "unknowns", "solver", "tolerance", "ms", "ratio", "iterations", "residual", "error")
     sections = [
         Section(
             "Holes of 8 %, by tolerance",
@@ -239,33 +234,34 @@ def report(results: Row) -> str:
             f"the assembled matrix on (assembling it with NumPy: {', '.join(assembly.values())}). Residual: ‖b − A·x‖ "
             "/ ‖b‖, b relative to the constant that fits best. Error: largest, over the range of the values, against "
             "the direct solution. Ratio: time over that of gimp3d at the same tolerance (at 1e-6 for direct solvers).",
-            head,
-            comparison(by_tolerance),
+            *columns(comparison(by_tolerance), COMPARED),
         ),
         Section(
             "Other shares and shapes",
             "parts: many, with islands, some at the image's border; screened: a fifth of the pixels drawn to values of "
             "their own.",
-            head,
-            comparison(results["by_shape"]),
+            *columns(comparison(results["by_shape"]), COMPARED),
         ),
     ]
     words = f"One thread, {about(results['machine'])} {results['versions']}."
     return markdown("Speed of the Poisson solver", words, sections)
 
 
-def comparison(rows: list[Row]) -> Iterator[list[Any]]:
+COMPARED = {"hole": "{hole}", "share": "{share:.0%}", "unknowns": "{unknowns:,}", "solver": "{solver}"}
+COMPARED |= {"tolerance": "{asked}", "ms": "{ms:.1f}", "ratio": "{ratio:.1f}", "iterations": "{steps}"}
+COMPARED |= {"residual": "{residual:.1e}", "error": "{error:.1e}"}
+
+
+def comparison(rows: list[Row]) -> Iterator[Row]:
     def key(row: Row) -> tuple[Any, ...]:
         return row["size"], row["share"], row["shape"], row["screened"]
 
     ours = {(key(r), r["tolerance"]): r["ms"] for r in where(rows, solver=OURS)}
     for r in rows:
         hole = r["size"] + ("" if r["shape"] == "blob" else f", {r['shape']}") + (", screened" if r["screened"] else "")
-        about_it = [hole, f"{r['share']:.0%}", f"{r['unknowns']:,}", r["solver"]]
-        about_it.append("direct" if r["tolerance"] is None else f"{r['tolerance']:.0e}")
+        asked = "direct" if r["tolerance"] is None else f"{r['tolerance']:.0e}"
         ratio = r["ms"] / ours[key(r), r["tolerance"] or DIRECT_AS]
-        steps = r.get("iterations") or ""
-        yield [*about_it, f"{r['ms']:.1f}", f"{ratio:.1f}", steps, f"{r['residual']:.1e}", f"{r['error']:.1e}"]
+        yield {**r, "hole": hole, "asked": asked, "ratio": ratio, "steps": r["iterations"] or ""}
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,12 +25,13 @@ from gimp3d.camera import Camera
 from gimp3d.compute.simd import fma16, splat16, store16
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.gaussians import Gaussians
+from gimp3d.memory import peak_memory_mb
 from gimp3d.raster import PictureGradients, backward, contributions, cpu, pixel_region, trace
 
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .plots import Line, Panel, draw_panels
-from .tables import Row, Section, in_words, markdown, shown, values, where
-from .timing import Watch, about, best_of, cost, in_new_process, machine, peak_mib, replaced
+from .tables import Row, Section, columns, in_words, markdown, shown, values, where
+from .timing import Watch, about, best_of, cost, in_new_process, machine, replaced, timed
 
 PASSES = frozenset({"rgb", "alpha", "expected_depth"})
 SEED = 0
@@ -154,12 +155,12 @@ def tile_phases() -> Iterator[list[tuple[float, float]]]:
     """What the work on tiles alone costs: blending, and the way back through it."""
     over_tiles, laps = cpu.over_tiles, []
 
-    def timed(*args: Any) -> None:
+    def watched(*args: Any) -> None:
         watch = Watch()
         over_tiles(*args)
         laps.append(watch.lap())
 
-    with replaced(cpu, "over_tiles", timed):
+    with replaced(cpu, "over_tiles", watched):
         yield laps
 
 
@@ -202,16 +203,12 @@ def speed(plan: Plan) -> Iterator[Row]:
         yield row
 
 
-@numba.njit
-def count_blocks(starts, ends, masks):
-    blocks = 0
-    for s in range(len(starts)):
-        for i in range(starts[s], ends[s]):
-            mask = masks[i]
-            while mask:
-                mask &= mask - np.uint64(1)
-                blocks += 1
-    return blocks
+def count_blocks(starts: np.ndarray, ends: np.ndarray, masks: np.ndarray) -> int:
+    """How many bits are set in the masks of the entries that lists, which do not overlap, used."""
+    steps = np.zeros(len(masks) + 1, np.int64)
+    np.add.at(steps, starts, 1)
+    np.add.at(steps, ends, -1)
+    return int(np.unpackbits(masks[steps.cumsum()[:-1] > 0].view(np.uint8)).sum())
 
 
 def blends(speed_rows: list[Row], peak: float) -> Iterator[Row]:
@@ -231,16 +228,11 @@ def peak_gflops() -> float:
     out, turns = np.empty(LANES, np.float32), 4_000_000
     best = 0.0
     for kernel, chains in ((five_chains, 5), (ten_chains, 10)):
-        kernel(1, np.float32(0.5), np.float32(1), out)
-        seconds = best_of(lambda k=kernel: timed_cpu(k, turns, out), 5)
-        best = max(best, 2 * LANES * chains * turns / float(seconds) / 1e9)
+        given = (np.float32(0.5), np.float32(1), out)
+        kernel(1, *given)  # compiles
+        _, cpu_ms = best_of(lambda k=kernel, g=given: timed(lambda: k(turns, *g)), 5)
+        best = max(best, 2 * LANES * chains * turns / cpu_ms / 1e6)
     return round(best, 2)
-
-
-def timed_cpu(kernel: Callable[..., None], turns: int, out: np.ndarray) -> float:
-    start = time.process_time()
-    kernel(turns, np.float32(0.5), np.float32(1), out)
-    return time.process_time() - start
 
 
 @numba.njit
@@ -367,84 +359,64 @@ def memory(count: int, size: Size) -> Row:
 def memory_peaks(count: int, size: Size) -> list[float]:
     warm_up()
     gaussians, view, gradients = scene(count), camera(size), picture_gradients(size)
-    peaks = [peak_mib()]
+    peaks = [round(peak_memory_mb(), 1)]
     _, traced = trace(gaussians, view, passes=PASSES)
-    peaks.append(peak_mib())
+    peaks.append(round(peak_memory_mb(), 1))
     _kept_until_read = backward(traced, gradients)
-    return [*peaks, peak_mib()]
+    return [*peaks, round(peak_memory_mb(), 1)]
 
 
 # ---------------------------------------------------------------------------------------------------- what is written
 
 
 def report(results: Row) -> str:
-    host, first = results["machine"], results["first_call"]
-
-    def rate(row: dict[str, float]) -> list[str]:
-        return [f"{row['giga_lanes_per_s']:.2f}", f"{row['share_of_peak']:.0%}" if "share_of_peak" in row else "—"]
-
-    costs, ratios = ("prepare", "iteration", "whole"), ("cpu_ratio", "wall_ratio")
+    host, first, torch = results["machine"], results["first_call"], results["torch"]
+    of = {"kind": "{kind}", "Gaussians": "{n:,}", "picture": "{size[0]}×{size[1]}"}
+    lanes = {"lanes": "{lanes:,}"}
+    for way in PHASES[:2]:
+        lanes |= {f"{way}, G/s": f"{{{way}[giga_lanes_per_s]:.2f}}", f"{way} of peak": f"{{{way}[share_of_peak]:.0%}}"}
+    region = {"depths": "{depths}", "active": "{active}", "threads": "{threads}", "first": ms("prepare")}
+    region |= {"iteration": ms("iteration"), "whole": ms("whole")}
+    region |= {"CPU ratio": "{cpu_ratio}", "wall ratio": "{wall_ratio}"}
+    versus = {"threads": "{threads}"}
+    for way in PHASES[:2]:
+        versus |= {f"ours {way}": ms(f"{way}[ours]"), f"theirs {way}": ms(f"{way}[theirs]")}
+        versus |= {f"wall ratio {way}": f"{{{way}[wall_ratio]}}"}
+    peaks = {"scene, MiB": "{scene_mib}", "after forward": "{forward_mib}", "after backward": "{backward_mib}"}
     sections = [
         Section(
             "Speed",
             "rgb, alpha and expected depth, SH degree 3. Milliseconds, wall (CPU), best of several.",
-            ["kind", "Gaussians", "picture", "threads", "forward", "backward"],
-            [[*named(r), r["threads"], pair(r["forward"]), pair(r["backward"])] for r in results["speed"]],
+            *columns(results["speed"], of | {"threads": "{threads}"} | {way: ms(way) for way in PHASES[:2]}),
         ),
         Section(
             "Blends per second",
             f"A lane is one Gaussian at one pixel: {BLEND_FLOPS} operations forward, {UNBLEND_FLOPS} backward. FMA "
             f"peak {results['peak_gflops_per_core']:.0f} GFLOP/s per core ({host['architecture']}, {host['vectors']}).",
-            ["kind", "Gaussians", "picture", "M lanes", "forward, G/s", "of peak", "backward, G/s", "of peak"],
-            [
-                [*named(r), f"{r['lanes'] / 1e6:.1f}", *rate(r["forward"]), *rate(r["backward"])]
-                for r in results["blends"]
-            ],
+            *columns(results["blends"], of | lanes),
         ),
         Section(
             "A region",
             "Forward and backward of active Gaussians in a rectangle, against those of the whole scene and picture.",
-            ["depths", "active", "threads", "first", "iteration", "whole", "CPU ratio", "wall ratio"],
-            [
-                [
-                    *(r[k] for k in ("depths", "active", "threads")),
-                    *(pair(r[k]) for k in costs),
-                    *(r[k] for k in ratios),
-                ]
-                for r in results["region"]
-            ],
+            *columns(results["region"], region),
         ),
-    ]
-    if torch := results["torch"]:
-        versus = [
-            [(r[name]["ours"], r[name]["theirs"], r[name]["wall_ratio"]) for name in PHASES[:2]] for r in torch["rows"]
-        ]
-        sections.append(
-            Section(
-                "Plain torch, tile by tile",
-                f"{in_words(torch['n'])} Gaussians, {shown(torch['size'])}. Its picture differs from ours by "
-                f"{torch['largest_difference']:.1e} at most, {torch['mean_difference']:.1e} in the mean.",
-                ["threads", "ours forward", "theirs", "wall ratio", "ours backward", "theirs", "wall ratio"],
-                [
-                    [r["threads"], *(cell for o, t, ratio in both for cell in (pair(o), pair(t), ratio))]
-                    for r, both in zip(torch["rows"], versus)
-                ],
-            )
-        )
-    sections.append(
         Section(
             "First call and memory",
             f"First forward and backward of a process ({in_words(first['n'])}, {shown(first['size'])}): "
             f"{first['cold_s']:.1f} s compiling, {first['warm_s']:.2f} s with kernels in the cache.",
-            ["Gaussians", "picture", "scene, MiB", "after forward", "after backward"],
-            [[*named(r)[1:], r["scene_mib"], r["forward_mib"], r["backward_mib"]] for r in results["memory"]],
-        )
-    )
+            *columns(results["memory"], of | peaks),
+        ),
+    ]
+    if torch:
+        words = f"{in_words(torch['n'])} Gaussians, {shown(torch['size'])}. Its picture differs from ours by "
+        words += f"{torch['largest_difference']:.1e} at most, {torch['mean_difference']:.1e} in the mean."
+        sections.append(Section("Plain torch, tile by tile", words, *columns(torch["rows"], versus)))
     return markdown("Speed of the rasteriser", about(host), sections)
 
 
-def named(row: Row) -> list[str]:
-    return [row.get("kind", ""), in_words(row["n"]), shown(row["size"])]
+def ms(key: str) -> str:
+    """The format of a cost: wall (CPU)."""
+    return f"{{{key}[wall_ms]:.1f}} ({{{key}[cpu_ms]:.1f}})"
 
 
 def pair(costs: dict[str, float]) -> str:

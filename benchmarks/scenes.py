@@ -25,7 +25,7 @@ from gimp3d.io.cameras import read_cameras
 from gimp3d.io.formats import read_scene as read_splats
 from gimp3d.io.images import load_view, read_image, read_mask, undistorted, write_png
 from gimp3d.pipeline import RemovalResult, RemovalSettings, View, remove_object, render_bytes
-from gimp3d.run import Observer, Store, unobserved
+from gimp3d.run import Observer, unobserved
 
 MADE = ("desk", "corner", "gloss", "rocks")  # rendered, without shadows
 REAL = ("real_table", "real_bed", "kitchen_monkey", "tiles_mug")
@@ -81,6 +81,10 @@ class Scene:
     def unseen(self, camera: Camera) -> np.ndarray:
         """[H, W] bool: the part of `hides` that no training view sees past the object."""
         return _mask(self._truth(camera, "unseen.png"))
+
+    def judged(self, camera: Camera) -> dict[str, np.ndarray]:
+        """Where a view is scored: those of MASKS that are not empty."""
+        return {name: m for name, m in zip(MASKS, (self.hides(camera), self.unseen(camera))) if m.any()}
 
     def shadow(self, camera: Camera) -> np.ndarray:
         """[H, W] bool: pixels that only the object's shadow darkens; none where no shadow is known."""
@@ -149,7 +153,6 @@ def removal(
     reference: Camera | None = None,
     picture: np.ndarray | None = None,
     views: Sequence[View] | None = None,  # None: the training views
-    store: Store | None = None,
     observer: Observer = unobserved,
 ) -> RemovalResult:
     """A removal of the scene's object; a reference that is no training view is drawn and put beside them."""
@@ -157,7 +160,7 @@ def removal(
     if reference is not None and reference.id not in {v.camera.id for v in given}:
         given.append(scene.drawn(reference))
     name = None if reference is None else reference.id
-    return remove_object(scene.gaussians, given, scene.region, settings, name, picture, store=store, observer=observer)
+    return remove_object(scene.gaussians, given, scene.region, settings, name, picture, observer=observer)
 
 
 def filled(gaussians: Gaussians, result: RemovalResult) -> Gaussians:
@@ -172,9 +175,8 @@ def scores(scene: Scene, pictures: Mapping[str, np.ndarray]) -> dict[str, float]
     for camera in scene.test:
         if camera.id in pictures:
             truth = scene.truth(camera)
-            for name, mask in zip(MASKS, (scene.hides(camera), scene.unseen(camera))):
-                found = score(pictures[camera.id], truth, mask) if mask.any() else {}
-                for metric, value in found.items():
+            for name, mask in scene.judged(camera).items():
+                for metric, value in score(pictures[camera.id], truth, mask).items():
                     rows.setdefault(f"{metric} {name}", []).append(value)
     return {key: float(np.mean(found)) for key, found in rows.items()}
 
@@ -184,9 +186,8 @@ def mean_psnrs(scene: Scene, splats: Gaussians, cameras: Iterable[Camera]) -> di
     found: dict[str, list[float]] = {name: [] for name in MASKS}
     for camera in cameras:
         drawn, truth = render_bytes(splats, camera), scene.truth(camera)
-        for name, mask in zip(MASKS, (scene.hides(camera), scene.unseen(camera))):
-            if mask.any():
-                found[name].append(psnr(drawn, truth, mask))
+        for name, mask in scene.judged(camera).items():
+            found[name].append(psnr(drawn, truth, mask))
     return {name: float(np.mean(of)) for name, of in found.items()}
 
 

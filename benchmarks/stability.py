@@ -23,29 +23,20 @@ from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
 from .plots import Line, Panel, draw_panels
 from .scenes import Scene, cached_scene, filled, mean_psnrs, read_scenes, removal, side_by_side
-from .tables import Row, Section, markdown, values, where
+from .tables import Row, Section, columns, markdown, values, where
 from .timing import about, machine
 
 SCENES = "desk,gloss"
 CLUSTER = 12  # views that look from one side
 SEED = 0
-LEVELS = {
-    "views": (9, 3, 2, 1),  # the reference among them; two are 1° apart
-    "cone": (90, 30, 10),  # degrees from the reference within which all views look; of CLUSTER views
-    "exposure": (0.1, 0.2, 0.4),  # each photo's gain, ±
-    "misplaced": (0.1, 0.2, 0.4),  # share of photos that are other views'
-    "garbled": (0.1, 0.2, 0.4),  # share of all photos' pixels that show something else
-    "surface": (0.01, 0.03, 0.1),  # noise of the references' completed depths, relative
-    "depths": (0.01, 0.03, 0.1),  # of all depths that are drawn
-}
-HEADINGS = {  # kind → heading, unit of its levels
-    "views": ("Views", ""),
-    "cone": ("All views within", "°"),
-    "exposure": ("Exposures off, ±", "%"),
-    "misplaced": ("Photos mixed up", "%"),
-    "garbled": ("Pixels garbled", "%"),
-    "surface": ("Surface off", "%"),
-    "depths": ("All depths off", "%"),
+KINDS = {  # heading, unit of its levels, and these
+    "views": ("Views", "", (9, 3, 2, 1)),  # the reference among them; two are 1° apart
+    "cone": ("All views within", "°", (90, 30, 10)),  # from the reference; of CLUSTER views
+    "exposure": ("Exposures off, ±", "%", (0.1, 0.2, 0.4)),  # each photo's gain
+    "misplaced": ("Photos mixed up", "%", (0.1, 0.2, 0.4)),  # photos that are other views'
+    "garbled": ("Pixels garbled", "%", (0.1, 0.2, 0.4)),  # of all photos: they show something else
+    "surface": ("Surface off", "%", (0.01, 0.03, 0.1)),  # noise of the references' completed depths, relative
+    "depths": ("All depths off", "%", (0.01, 0.03, 0.1)),  # of all depths that are drawn
 }
 QUICK = {"views": (1,), "misplaced": (0.1,), "surface": (0.1,)}
 WRONG_PHOTOS = {"exposure": exposed, "misplaced": misplaced, "garbled": garbled}
@@ -57,8 +48,8 @@ def main() -> None:
     parser.add_argument("--preset", default="balanced", choices=PRESETS)
     given = parser.parse_args()
     scenes = read_scenes(given.data, given.scenes.split(",")[0] if given.quick else given.scenes, needs_truth=True)
-    levels = (QUICK if given.quick else LEVELS).items()
-    asked = [("none", 0.0), *((kind, level) for kind, of_kind in levels for level in of_kind)]
+    levels = QUICK if given.quick else {kind: of_kind for kind, (_, _, of_kind) in KINDS.items()}
+    asked = [("none", 0.0), *((kind, level) for kind, of_kind in levels.items() for level in of_kind)]
     results: Row = {"machine": machine(), "preset": given.preset, "rows": []}
     with side_by_side() as workers:
         folders, cases = zip(*product([s.folder for s in scenes], asked))
@@ -120,29 +111,26 @@ def grown(new: Gaussians | None, region: Region) -> Row:
 
 
 def label(kind: str, level: float) -> str:
-    return f"{100 * level:g}" if HEADINGS[kind][1] == "%" else f"{level:g}"
+    return f"{100 * level:g}" if KINDS[kind][1] == "%" else f"{level:g}"
 
 
 def report(results: Row) -> str:
-    lines = []
+    rows = []
     for r in results["rows"]:
-        words = ["unperturbed", ""]
-        if r["kind"] in HEADINGS:
-            heading, unit = HEADINGS[r["kind"]]
-            words = [heading, label(r["kind"], r["level"]) + unit]
-        if "refused" in r:
-            lines.append([r["scene"], *words, r["refused"], *[""] * 8])
-            continue
-        numbers = [f"{r[k]:.2f}" for k in ("mask", "unseen", "open mask", "open unseen")]
-        ends = [r["added"], "yes" if r["finite"] else "NO", f"{100 * r['largest']:.2f}", f"{r['farthest']:.2f}"]
-        lines.append([r["scene"], *words, *numbers, *ends, "; ".join(r["warnings"])])
-    head = ["scene", "what is wrong", "by", "mask", "unseen", "hole open: mask", "unseen", "added", "finite"]
+        heading, unit, _ = KINDS.get(r["kind"], ("unperturbed", "", ()))
+        level = label(r["kind"], r["level"]) + unit if r["kind"] in KINDS else ""
+        said = r.get("refused") or "; ".join(r["warnings"])
+        finite = {True: "yes", False: "NO"}.get(r.get("finite"), "")
+        rows.append({**r, "what": heading, "by": level, "finite": finite, "said": said})
+    forms = {"scene": "{scene}", "what is wrong": "{what}", "by": "{by}", "mask": "{mask:.2f}"}
+    forms |= {"unseen": "{unseen:.2f}", "hole open: mask": "{open mask:.2f}", "hole open: unseen": "{open unseen:.2f}"}
+    forms |= {"added": "{added}", "finite": "{finite}", "largest": "{largest:.2%}"}
+    forms |= {"farthest": "{farthest:.2f}", "warnings": "{said}"}
     section = Section(
         "Removals",
         "PSNR in dB of the test views but the reference. *Largest*: the largest new standard deviation; *farthest*: "
         "the farthest new Gaussian from the box's centre; both in diagonals of the box.",
-        [*head, "largest, %", "farthest", "warnings"],
-        lines,
+        *columns(rows, forms),
     )
     words = f"{about(results['machine'])} Preset {results['preset']}."
     return markdown("Whole removals whose input is wrong", words, [section])
@@ -158,7 +146,7 @@ def draw(results: Row, path: Path) -> None:
         "largest": "largest splat, %",
     }.items():
         grid.append([])
-        for kind in (k for k in HEADINGS if where(results["rows"], kind=k)):
+        for kind in (k for k in KINDS if where(results["rows"], kind=k)):
             levels = values(where(results["rows"], kind=kind), "level")
             lines = []
             for scene in values(results["rows"], "scene"):
@@ -172,7 +160,7 @@ def draw(results: Row, path: Path) -> None:
                 opened = [(x, r[f"open {measure}"]) for x, r in found]
                 lines.append(Line(f"{scene}, hole left open", opened, scene, "--", hollow=True))
             ticks = {0.0: "–"} | {n + 1.0: label(kind, level) for n, level in enumerate(levels)}
-            heading = ", ".join(filter(None, HEADINGS[kind])) if measure == "mask" else ""
+            heading = ", ".join(filter(None, KINDS[kind][:2])) if measure == "mask" else ""
             grid[-1].append(Panel(heading, lines, "", words, False, measure == "largest", ticks, named=False))
     words = "Test views but the reference; –: unperturbed; largest splat: its standard deviation by the box's diagonal"
     draw_panels(path, "What wrong input does to a removal", words, grid, (2.4, 2.3))

@@ -29,7 +29,7 @@ from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .perturbations import moved, noisy_depths, resized, turned
 from .plots import Line, Panel, draw_panels
 from .scenes import SHADOW, Scene, read_scenes
-from .tables import Row, Section, markdown, mean, sheet, values, where
+from .tables import Row, Section, columns, markdown, mean, sheet, values, where
 from .timing import about, machine
 
 MODES = ("need", "paper")
@@ -157,10 +157,7 @@ def shadow(name: str, results: Row, unperturbed: dict[str, dict[str, np.ndarray]
 
 
 def scene_masks(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    settings: MaskSettings = MaskSettings(),
-    region: Region | None = None,
+    scene: Scene, cameras: Sequence[Camera], settings: MaskSettings = MaskSettings(), region: Region | None = None
 ) -> Masks:
     """The stage as a removal calls it."""
     return find_masks(scene.gaussians, region or scene.region, cameras, settings, photos=scene.photos)
@@ -283,25 +280,14 @@ def sections(results: Row) -> Iterator[Section]:
         "Training views. Covered: share of the pixels that no view sees, without their 1-px rim, that T holds (wanted: "
         "99 %). Area: of T over that of never-seen pixels (wanted: 1.6 at most). Silhouette: overlap (IoU) with "
         "what the object truly hides. Seconds: CPU, of all threads together.",
-        ["scene", "mode", "covered", "worst view", "area", "silhouette", "hole pixels", "CPU s"],
-        [
-            [r["scene"], r["mode"], *(form.format(r[key]) for key, form in MASK_FORMS.items())]
-            for r in [*results["masks"], *means]
-        ],
+        *columns([*results["masks"], *means], OF_MASKS),
     )
+    said = ({**r, "of": output_name(r["view"]), "said": r.get("refused") or r["reason"]} for r in results["depths"])
     yield Section(
         "Each test view as the reference",
         "T there, and the surface that the default settings complete: relative error of z in never-seen pixels without "
         "their 1-px rim, median and 95th percentile. Pixels with no depth are wrong by 100 %.",
-        ["scene", "view", "covered", "area", "median", "95 %", "what happened"],
-        [
-            [
-                *(r["scene"], output_name(r["view"])),
-                *(form.format(r[key]) if key in r else "" for key, form in FORMS.items()),
-                r.get("refused") or r["reason"],
-            ]
-            for r in results["depths"]
-        ],
+        *columns(said, OF_DEPTHS),
     )
     yield Section(
         "Stability",
@@ -327,29 +313,27 @@ def sections(results: Row) -> Iterator[Section]:
         )
 
 
-MASK_FORMS = {"covered": "{:.2%}", "worst_view_covered": "{:.2%}", "area": "{:.2f}", "silhouette_iou": "{:.3f}"}
-MASK_FORMS |= {"hole_pixels": "{:.0f}", "cpu_s": "{:.1f}"}
-FORMS = {"covered": "{:.2%}", "area": "{:.2f}", "median": "{:.2%}", "p95": "{:.2%}"}
+FORMS = {"iou": "{:.3f}", "covered": "{:.2%}", "area": "{:.2f}", "median": "{:.2%}"}
+OF_MASKS = {"scene": "{scene}", "mode": "{mode}", "covered": "{covered:.2%}", "worst view": "{worst_view_covered:.2%}"}
+OF_MASKS |= {"area": "{area:.2f}", "silhouette": "{silhouette_iou:.3f}", "hole pixels": "{hole_pixels:.0f}"}
+OF_MASKS |= {"CPU s": "{cpu_s:.1f}"}
+OF_DEPTHS = {"scene": "{scene}", "view": "{of}", "covered": "{covered:.2%}", "area": "{area:.2f}"}
+OF_DEPTHS |= {"median": "{median:.2%}", "95 %": "{p95:.2%}", "what happened": "{said}"}
 
 
 def stability_rows(rows: list[Row]) -> Iterator[list[str]]:
     best: dict[str, Callable[[list[float]], float]] = {"iou": min, "covered": min, "area": max, "median": max}
-    forms = {"iou": "{:.3f}", **FORMS}
     for kind, label in dict.fromkeys((r["kind"], r["label"]) for r in rows):
         same = where(rows, kind=kind, label=label)
         done = [r for r in same if "refused" not in r]
         cells = [
-            f"{forms[k].format(mean(done, k))} ({forms[k].format(worst([r[k] for r in done]))})" if done else ""
+            f"{FORMS[k].format(mean(done, k))} ({FORMS[k].format(worst([r[k] for r in done]))})" if done else ""
             for k, worst in best.items()
         ]
         refused = sum(r["views_refused"] for r in done)
         words = [f"{len(same) - len(done)} runs"] * (len(done) < len(same)) + [f"{refused} views"] * (refused > 0)
-        yield [
-            KINDS[kind][0] if kind in KINDS else "nothing",
-            "" if kind == "none" else label,
-            *cells,
-            ", ".join(words),
-        ]
+        what = (KINDS[kind][0], label) if kind in KINDS else ("nothing", "")
+        yield [*what, *cells, ", ".join(words)]
 
 
 # --------------------------------------------------------------------------------------------------------------- charts
@@ -370,9 +354,8 @@ def panel(heading: str, measure: str, labels: Sequence[str], lines: Lines, joine
     for n, (name, line) in enumerate(lines.items()):
         dark, shift = name.endswith(SHADOW), 0.0 if joined else 0.07 * (n - (len(lines) - 1) / 2)
         points = [(x + shift, unit * r[measure]) for x, r in line]
-        drawn.append(Line(name, points, name.removesuffix(SHADOW), "--" if dark else "-", hollow=dark))
-        if not joined:
-            drawn[-1] = Line(name, points, name.removesuffix(SHADOW), "none", hollow=dark)
+        style = "none" if not joined else "--" if dark else "-"
+        drawn.append(Line(name, points, name.removesuffix(SHADOW), style, hollow=dark))
     ticks = {float(k): label for k, label in enumerate(labels)}
     return Panel(heading, drawn, "", words, False, logarithmic, ticks, wanted, named=False)
 

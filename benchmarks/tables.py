@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +18,18 @@ Row = dict[str, Any]
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "".join("| " + " | ".join(str(cell) for cell in line) + " |\n" for line in lines)
+
+
+def columns(rows: Iterable[Row], forms: Mapping[str, str]) -> tuple[list[str], list[list[str]]]:
+    """Head and lines of a table: what stands over each column, and the format of what a row says there, if it does."""
+
+    def cell(form: str, row: Row) -> str:
+        try:
+            return form.format(**row)
+        except KeyError:
+            return ""
+
+    return list(forms), [[cell(form, row) for form in forms.values()] for row in rows]
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:

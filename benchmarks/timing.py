@@ -8,10 +8,10 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import llvmlite.binding
 import numba
@@ -21,6 +21,7 @@ from gimp3d.compute.threads import available_cores
 
 from .command import ROOT
 
+replaced = patch.object  # (owner, name, value): a module's attribute has another value inside
 SLOW_MS, SLOW_REPETITIONS = 1000.0, 3  # what takes longer is repeated less often
 
 
@@ -83,21 +84,3 @@ def in_new_process(module: str, call: str, **environment: str) -> Any:
     command, given = [sys.executable, "-c", code], {**os.environ, **environment, "PYTHONPATH": paths}
     done = subprocess.run(command, env=given, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def peak_mib() -> float:
-    import resource  # not on Windows
-
-    unit = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20, 1)
-
-
-@contextmanager
-def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """A module's attribute has another value inside."""
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)

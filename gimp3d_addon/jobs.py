@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import bpy
@@ -19,9 +20,10 @@ import numpy as np
 
 from gimp3d.camera import Camera, output_name
 from gimp3d.errors import BadInput
+from gimp3d.files import write_json
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_ply
-from gimp3d.job import RemovalJob, save_job, write_atomically
+from gimp3d.job import RemovalJob, save_job
 
 from . import backdrops, bridge, splats, trust
 from .chosen import current_boxes, current_splat, present
@@ -59,14 +61,11 @@ def jobs_folder() -> Path:
 def new_job_folder(name: str) -> Path:
     """A folder of its own, made now, so that another Blender takes another one."""
     clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "scene"
-    number = 1
-    while True:
+    for number in count(1):
         folder = jobs_folder() / f"{clean}-{number:03d}"
-        try:
+        with suppress(FileExistsError):
             folder.mkdir(parents=True)
             return folder
-        except FileExistsError:
-            number += 1
 
 
 def open_for(context: bpy.types.Context, folder: Path, splat: bpy.types.Object) -> None:
@@ -190,7 +189,7 @@ def _path_of(folder: Path) -> Path:
 
 
 def _write(record: Record) -> None:
-    write_atomically(_path_of(Path(record.folder)), lambda f: f.write(json.dumps(asdict(record)).encode()))
+    write_json(_path_of(Path(record.folder)), asdict(record))
     _last.clear()
 
 
@@ -240,17 +239,14 @@ def write_job(context: bpy.types.Context, folder: Path) -> RemovalJob:
         backdrops.save_mask(mask, folder / "shadows" / f"{output_name(shaded.id)}.png")
     write_ply(folder / "scene.ply", file, np.ones(len(file.gaussians), bool))
     write_transforms(folder / "transforms.json", [_with_photo(c, folder / PHOTOS) for c, _ in views])
-    write_atomically(folder / "roi.json", lambda f: f.write(json.dumps(region, indent=1).encode()))
+    write_json(folder / "roi.json", region)
     copied = folder / f"reference{picture.suffix or '.png'}"
     if settings.reference_paint is not None:
         settings.reference_paint.save(filepath=str(copied), save_copy=True)
     elif picture.name:
         shutil.copyfile(picture, copied)
     job = RemovalJob(
-        scene=str(folder / "scene.ply"),
-        cameras=str(folder / "transforms.json"),
-        roi=str(folder / "roi.json"),
-        out=str(folder / "out.ply"),
+        *(str(folder / name) for name in ("scene.ply", "transforms.json", "roi.json", "out.ply")),
         images=str(folder / PHOTOS) if (folder / PHOTOS).is_dir() else "none",
         reference=reference or None,
         reference_image=str(copied) if picture.name or settings.reference_paint is not None else None,

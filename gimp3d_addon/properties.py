@@ -80,11 +80,7 @@ class GIMP3D_PG_settings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         update=_know_picture,
     )
-    grow: BoolProperty(
-        name="Grow",
-        default=False,
-        description="Also remove what the box cut off of the object",
-    )
+    grow: BoolProperty(name="Grow", default=False, description="Also remove what the box cut off of the object")
     shadow: EnumProperty(
         items=SHADOWS, name="Shadow", default="auto", description="What becomes of the object's shadow"
     )

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from gimp3d.files import write_json
 from gimp3d.io.cameras import PHOTOS
-from gimp3d.job import write_atomically
 
 from .installation import user_folder
 
@@ -89,5 +89,5 @@ def _read(name: str) -> list[str]:
 
 
 def _write(name: str, entries: list[str]) -> None:
-    write_atomically(user_folder("trusted") / name, lambda f: f.write(json.dumps(entries, indent=1).encode()))
+    write_json(user_folder("trusted") / name, entries)
     _last.pop(name, None)

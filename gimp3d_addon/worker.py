@@ -123,11 +123,8 @@ class Worker:
     def poll(self) -> bool:
         """Take what the child said; true once it has ended."""
         ended = not self._reader.is_alive()
-        while True:
-            try:
-                self._take(self._lines.get_nowait())
-            except queue.Empty:
-                break
+        while not self._lines.empty():  # nobody else takes them
+            self._take(self._lines.get())
         return ended and self._process.poll() is not None
 
     def join(self) -> None:

@@ -71,12 +71,11 @@ def rug(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return colour * (0.9 + 0.2 * noise(9 * x, 9 * y, 2))[:, None]
 
 
-def splat(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, step: float, shade: bool = True) -> Gaussians:
+def splat(points: np.ndarray, normals: np.ndarray, colours: np.ndarray, step: float) -> Gaussians:
     """Thin discs on a surface, lit by one lamp and the sky."""
     n = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    if shade:
-        lit = 0.62 + 0.45 * np.clip(n @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
-        colours = colours * lit[:, None]
+    lit = 0.62 + 0.45 * np.clip(n @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
+    colours = colours * lit[:, None]
     helper = np.where(np.abs(n[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
     a = np.cross(helper, n)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
@@ -153,10 +152,7 @@ def ball(
 
 
 def cuboid(
-    centre: tuple[float, float, float],
-    size: tuple[float, float, float],
-    turn: float,
-    colour: tuple[float, ...],
+    centre: tuple[float, float, float], size: tuple[float, float, float], turn: float, colour: tuple[float, ...]
 ) -> Gaussians:
     """A book: five faces, pages on the long side."""
     c, s = math.cos(turn), math.sin(turn)

@@ -11,13 +11,12 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-TOOL = Path(os.environ.get("REAL_BLENDER", ROOT.parent / "shared" / "tools" / "real-blender"))
+from real_blender import ROOT, TOOL, run
+
 SOURCES = ("core", "gimp3d_addon", "tests", "assets", "docs", "tools", "pyproject.toml", "README.md", "LICENSE")
 TESTS = ("-m", "pytest", "tests/addon", "-m", "not slow", "--ignore", "tests/addon/test_extension.py")
 OLD, NEW = "4.5.15", "5.2.3"
@@ -35,7 +34,7 @@ def main() -> None:
         run(sys.executable, "-m", "venv", python.parents[1])
         run(python, "-m", "pip", "install", "--quiet", f"bpy=={OLD}", *libraries)
     print(f"test_blenders: Blender {OLD}", flush=True)
-    run("env", f"PYTHONPATH={ROOT / 'core'}", python, *TESTS, cwd=ROOT)
+    run("env", "-C", ROOT, f"PYTHONPATH={ROOT / 'core'}", python, *TESTS)
 
     if not TOOL.exists() or os.geteuid() != 0:
         print(f"test_blenders: Blender {NEW} skipped: it needs {TOOL.name} and root")
@@ -54,10 +53,6 @@ def main() -> None:
     print(f"test_blenders: Blender {NEW}", flush=True)
     environment = ("env", "-C", "/root/checkout", "PYTHONPATH=/root/checkout/core")
     run(TOOL, "run", root, *environment, "/root/bpy/bin/python", *TESTS)
-
-
-def run(*command: object, cwd: Path | None = None) -> None:
-    subprocess.run([str(c) for c in command], check=True, cwd=cwd)
 
 
 if __name__ == "__main__":

@@ -79,11 +79,7 @@ class Box:
         return self.center + (signs * self.size / 2) @ self.axes.T
 
     def to_json(self) -> dict[str, list[float]]:
-        return {
-            "center": self.center.tolist(),
-            "size": self.size.tolist(),
-            "rotation_wxyz": self.rotation_wxyz.tolist(),
-        }
+        return {name: getattr(self, name).tolist() for name in ("center", "size", "rotation_wxyz")}
 
 
 Region = tuple[Box, ...]

@@ -211,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(shown: Reporter, code: int, message: str) -> int:
     line = re.sub(r"\s+", " ", message)
-    shown.error(line)
+    shown.last(stage="error", message=line)
     say(f"gimp3d: error: {line}", sys.stderr)
     return code
 
@@ -257,13 +257,10 @@ class Reporter:
             say(f"\r{line:<{self._width}}", sys.stderr, "\n" if done >= total else "\r")
             self._width = 0 if done >= total else len(line)
 
-    def done(self, summary: dict[str, Any]) -> None:
+    def last(self, **facts: Any) -> None:
+        """How it ended, where somebody reads lines."""
         if self.kind == "json":
-            say(json.dumps({"stage": "done", "summary": summary}), sys.stdout)
-
-    def error(self, message: str) -> None:
-        if self.kind == "json":
-            say(json.dumps({"stage": "error", "message": message}), sys.stdout)
+            say(json.dumps(facts), sys.stdout)
 
 
 def _values(given: Namespace, *others: str) -> dict[str, Any]:
@@ -315,7 +312,7 @@ def _remove(given: Namespace, shown: Reporter) -> None:
             raise
         say(f"gimp3d: warning: interrupted after {job.out} was written, which is complete", sys.stderr)
         return
-    shown.done(summary)
+    shown.last(stage="done", summary=summary)
     if not given.quiet and given.progress == "bar":
         counts = summary["counts"]
         seconds = time.perf_counter() - start

@@ -30,15 +30,7 @@ from .job import MOST_VARIANTS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
-from .pipeline import (
-    RemovalResult,
-    RemovalSettings,
-    View,
-    look_behind,
-    preview,
-    remove_object,
-    render_bytes,
-)
+from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
@@ -49,7 +41,6 @@ from .stages.masks import MaskSettings, find_masks
 from .steps.completion import charts_to_paint
 from .steps.light import NOT_LIT
 from .store import SharedStages, StageStore
-from .stored import STORED
 from .summary import summary_of, variant_facts
 from .view_state import ViewState
 
@@ -95,6 +86,11 @@ def convert(source: Path, target: Path) -> None:
         raise BadInput(f"convert: {target} must end in .ply")
     try_target(target)
     write_gaussians(target, read_scene(source).gaussians)
+
+
+def _precise(file: SplatFile) -> Gaussians:
+    """The Gaussians with their centres in the file's own precision."""
+    return replace(file.gaussians, means=positions(file))
 
 
 def select_cameras(
@@ -162,10 +158,10 @@ def render_views(
     if not all(0 <= b <= 1 for b in background):
         raise BadInput("render: --background takes three numbers from 0 to 1")
     try_target(out, is_folder=True)
-    file = read_scene(scene)
+    given = _precise(read_scene(scene))
     chosen = select_cameras(read_cameras(cameras), split, frames)
-    frame = frame_of(file, chosen)
-    gaussians = frame.scene(file)
+    frame = frame_of(given, chosen)
+    gaussians = frame.scene(given)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
     for done, camera in enumerate(chosen, 1):
@@ -210,10 +206,10 @@ def write_masks(
     _use_threads(threads)
     for folder in (out, *([pictures] if pictures else [])):
         try_target(folder, is_folder=True)
-    file, region = read_scene(scene), read_region(roi)
+    given, region = _precise(read_scene(scene)), read_region(roi)
     available = read_cameras(cameras, _images_folder(images))
-    frame = frame_of(file, available)
-    gaussians, region = frame.scene(file), frame.region(region)
+    frame = frame_of(given, available)
+    gaussians, region = frame.scene(given), frame.region(region)
     written = select_cameras(available, split, frames)
     names = {c.id for c in written}
     looked_at = [c for c in available if c.split == "train" or c.id in names]  # in the file's order, as a removal does
@@ -259,10 +255,8 @@ def write_orbit(
     fov_degrees: float = 50.0,
 ) -> tuple[np.ndarray, str]:
     """Write cameras round a region, for a scene that has none; returns what is up, and why."""
-    file, region = read_scene(scene), read_region(roi)
-    gaussians = replace(file.gaussians, means=positions(file))
-    axis = None if up is None else np.asarray(up)
-    why = "as given"
+    gaussians, region = _precise(read_scene(scene)), read_region(roi)
+    axis, why = None if up is None else np.asarray(up), "as given"
     if axis is None:
         axis, why = measured_up(gaussians, region), "away from the floor under the region"
     if axis is None:
@@ -318,36 +312,26 @@ def run_removal(
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
     warnings = _scene_warnings(file)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    frame = frame_of(file, cameras)
-    scene = frame.scene(file)
+    given = _precise(file)
+    frame = frame_of(given, cameras)
+    scene = frame.scene(given)
     views, rendered = _load_views(cameras, job.images, scene, frame)
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
-    given = read_image(Path(job.reference_image)) if job.reference_image else None
+    picture = read_image(Path(job.reference_image)) if job.reference_image else None
     extra = _read_marks("--extra-masks", job.extra_masks, cameras)
     shadow = _read_marks("--shadow-masks", job.shadow_masks, cameras)
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     key = _job_key(job, views, (extra, shadow)) if folder else ""
     shared = SharedStages(BEFORE_FILL if job.variants > 1 else ())
+    inputs, reference = (scene, views, frame.region(region)), _clean_id(job.reference)
     results: list[RemovalResult] = []
     for variant in range(settings.variant, settings.variant + job.variants):
         of_variant = replace(settings, variant=variant)
         if folder:
             stages = folder / "stages" / (str(variant + 1) if variant else "")
-            shared.own = StageStore(stages, key, STORED, resume, asdict(of_variant))
-        result = remove_object(
-            scene,
-            views,
-            frame.region(region),
-            of_variant,
-            _clean_id(job.reference),
-            given,
-            progress,
-            shared,
-            extra,
-            shadow,
-            allow_network,
-        )
+            shared.own = StageStore(stages, key, resume, asdict(of_variant))
+        result = remove_object(*inputs, of_variant, reference, picture, progress, shared, extra, shadow, allow_network)
         charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
         results.append(replace(result, charts=charts, proposed=proposed))
     summary = summary_of(job, settings, file, results[0], warnings, time.perf_counter() - start)
@@ -450,9 +434,8 @@ def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str
     digest = hashlib.sha256(__version__.encode())
     free = ("out", "views_out", "report", "summary", "threads", "device", "variants")
     files = ("scene", "cameras", "roi", "reference_image")
-    settings = {
-        k: v for k, v in asdict(job).items() if k not in (*free, *files, "images", "extra_masks", "shadow_masks")
-    }
+    folders = ("images", "extra_masks", "shadow_masks")
+    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, *folders)}
     digest.update(json.dumps(settings, sort_keys=True).encode())
     for path in (getattr(job, f) for f in files):
         if path and Path(path).is_file():

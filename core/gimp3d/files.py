@@ -50,11 +50,7 @@ def require_file(path: Path) -> Path:
     BadInput
         If it is a pipe, a socket or a device.
     """
-    try:
-        kind = path.stat().st_mode
-    except (OSError, ValueError):  # whoever opens it says why it cannot be read
-        return path
-    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+    if is_stream(path):
         raise BadInput(f"{path} is a pipe or a device; a file is needed, as it is read more than once")
     return path
 
@@ -71,18 +67,20 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     """
     try:
         if is_stream(path):
-            with path.open("wb", buffering=0) as stream:
-                write(_Whole(stream))  # type: ignore[arg-type]
+            with path.open("wb") as stream:
+                write(stream)
             return
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(f".{os.getpid()}{UNFINISHED}", f".{_short(target.name)}.", target.parent)
+        name = target.with_name(f".{_short(target.name)}.{secrets.token_hex(4)}.{os.getpid()}{UNFINISHED}")
+        old = target.stat() if target.exists() else None
         try:
-            with os.fdopen(handle, "wb") as file:
+            with open(name, "xb", opener=lambda n, flags: os.open(n, flags, 0o600 if old else 0o666)) as file:
                 write(file)
                 file.flush()
                 os.fsync(file.fileno())
-            _take_permissions(name, target)
+            if old:
+                _take_permissions(name, old)
             os.replace(name, target)
         except BaseException:
             with suppress(OSError):
@@ -132,11 +130,10 @@ def sweep(folders: Iterable[Path]) -> None:
 
 def is_stream(path: Path) -> bool:
     """A pipe, a socket or a device, which is written to and never replaced."""
-    try:
-        kind = os.stat(path).st_mode
-    except OSError:
-        return False
-    return not stat.S_ISREG(kind) and not stat.S_ISDIR(kind)
+    with suppress(OSError, ValueError):  # whoever opens it says why it cannot be read
+        kind = path.stat().st_mode
+        return not stat.S_ISREG(kind) and not stat.S_ISDIR(kind)
+    return False
 
 
 def identity(path: Path) -> tuple[int, ...] | None:
@@ -148,41 +145,12 @@ def identity(path: Path) -> tuple[int, ...] | None:
     return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
 
 
-class _Whole:
-    """A stream without buffer that takes every byte, and no seeking."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream, self._at = stream, 0
-
-    def write(self, data: Any) -> int:
-        rest = memoryview(data).cast("B")
-        size = len(rest)
-        while len(rest):
-            rest = rest[self._stream.write(rest) :]
-        self._at += size
-        return size
-
-    def flush(self) -> None:
-        pass
-
-    def tell(self) -> int:
-        return self._at
-
-    def read(self, *_: Any) -> bytes:
-        raise OSError("a stream is written only")
-
-
-def _take_permissions(name: str, target: Path) -> None:
+def _take_permissions(path: Path, old: os.stat_result) -> None:
     """A new file gets the permissions, and where that is allowed the owner, of the one that it replaces."""
-    try:
-        old = target.stat()
-    except OSError:
-        os.chmod(name, 0o666 & ~_umask())
-        return
     if hasattr(os, "chown"):
         with suppress(OSError):
-            os.chown(name, old.st_uid, old.st_gid)
-    os.chmod(name, stat.S_IMODE(old.st_mode))
+            os.chown(path, old.st_uid, old.st_gid)
+    path.chmod(stat.S_IMODE(old.st_mode))
 
 
 def _short(name: str) -> str:
@@ -200,9 +168,3 @@ def _alive(process: int) -> bool:
     except OSError:
         return True
     return process != os.getpid()
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -15,7 +15,6 @@ import numpy as np
 from .box import Box, Region
 from .camera import Camera
 from .gaussians import Gaussians
-from .io.ply import SplatFile, positions
 
 if TYPE_CHECKING:
     from .stages.charts import Chart
@@ -38,14 +37,13 @@ class Frame:
         """True where nothing is changed."""
         return self.scale == 1 and not self.origin.any()
 
-    def scene(self, scene: SplatFile | Gaussians) -> Gaussians:
+    def scene(self, scene: Gaussians) -> Gaussians:
         """The Gaussians in this frame, in single precision; of means in double precision it keeps the digits."""
-        gaussians, points = _of(scene)
         if self.is_files:
-            return replace(gaussians, means=gaussians.means.astype(np.float32, copy=False))
+            return replace(scene, means=scene.means.astype(np.float32, copy=False))
         with np.errstate(over="ignore", invalid="ignore"):
-            means = ((points - self.origin) * self.scale).astype(np.float32)
-        return replace(gaussians, means=means, log_scales=self._sizes(gaussians, self.scale))
+            means = ((scene.means.astype(np.float64) - self.origin) * self.scale).astype(np.float32)
+        return replace(scene, means=means, log_scales=self._sizes(scene, self.scale))
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the file's frame in this one."""
@@ -96,20 +94,19 @@ class Frame:
 FILES = Frame(np.zeros(3), 1.0)
 
 
-def frame_of(scene: SplatFile | Gaussians, cameras: Sequence[Camera]) -> Frame:
+def frame_of(scene: Gaussians, cameras: Sequence[Camera]) -> Frame:
     """The frame that suits a scene as these cameras see it: near the origin and of ordinary size.
 
     Most scenes are so already, and keep theirs.
 
     Examples
     --------
-    >>> file, cameras = read_ply("scene.ply"), read_cameras("transforms.json")
-    >>> frame_of(file, cameras).scale
+    >>> scene, cameras = read_ply("scene.ply").gaussians, read_cameras("transforms.json")
+    >>> frame_of(scene, cameras).scale
     1.0
     """
-    gaussians, points = _of(scene)
-    usable = np.flatnonzero(gaussians.usable)
-    points = points[usable[:: len(usable) // SAMPLED + 1]]
+    usable = np.flatnonzero(scene.usable)
+    points = scene.means[usable[:: len(usable) // SAMPLED + 1]].astype(np.float64)
     depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]
     usual = float(np.nanmedian(depths)) if np.isfinite(depths).any() else np.nan
     if not np.isfinite(usual) or usual <= 0:
@@ -120,13 +117,6 @@ def frame_of(scene: SplatFile | Gaussians, cameras: Sequence[Camera]) -> Frame:
         return Frame(np.zeros(3), scale)
     step = 2.0 ** round(np.log2(usual))  # so that single precision loses nothing by the difference
     return Frame(np.round(middle / step) * step, scale)
-
-
-def _of(scene: SplatFile | Gaussians) -> tuple[Gaussians, np.ndarray]:
-    """The Gaussians, and their means in all the digits that there are."""
-    if isinstance(scene, Gaussians):
-        return scene, scene.means.astype(np.float64)
-    return scene.gaussians, positions(scene)
 
 
 def _usual_depth(points: np.ndarray, camera: Camera) -> float:

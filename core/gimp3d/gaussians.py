@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 SH_C0 = 0.28209479177387814  # Y_0; 3DGS stores colour as 0.5 + SH_C0 * f_dc, gamma-encoded sRGB
+ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh")  # what Gaussians are made of, a row each
 
 
 @dataclass(frozen=True)
@@ -26,16 +27,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = len(self.means)
-        shapes = {
-            "means": (self.means.shape, (n, 3)),
-            "log_scales": (self.log_scales.shape, (n, self.log_scales.shape[-1])),
-            "quats": (self.quats.shape, (n, 4)),
-            "opacity_logits": (self.opacity_logits.shape, (n,)),
-            "sh": (self.sh.shape, (n, self.sh.shape[1], 3)),
-        }
-        for name, (given, expected) in shapes.items():
-            if given != expected:
-                raise ValueError(f"{name}: expected shape {expected}, got {given}")
+        expected = ((n, 3), (n, self.log_scales.shape[-1]), (n, 4), (n,), (n, self.sh.shape[1], 3))
+        for name, shape in zip(ARRAYS, expected):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
         if self.log_scales.shape[1] not in (2, 3) or self.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(f"not a Gaussian set: {self.log_scales.shape[1]} scales, {self.sh.shape[1]} SH bands")
 
@@ -72,28 +67,15 @@ class Gaussians:
 
     def take(self, rows: np.ndarray) -> Gaussians:
         """The Gaussians at `rows` (indices or a boolean mask), in that order."""
-        return replace(
-            self,
-            means=self.means[rows],
-            log_scales=self.log_scales[rows],
-            quats=self.quats[rows],
-            opacity_logits=self.opacity_logits[rows],
-            sh=self.sh[rows],
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
     def extended(self, other: Gaussians) -> Gaussians:
         """These Gaussians followed by `other` of the same kind; the lower SH degree is padded with zeros."""
         if self.is_surfels != other.is_surfels:
             raise ValueError("cannot join 3D Gaussians and surfels")
         bands = max(self.sh.shape[1], other.sh.shape[1])
-        return replace(
-            self,
-            means=np.concatenate([self.means, other.means]),
-            log_scales=np.concatenate([self.log_scales, other.log_scales]),
-            quats=np.concatenate([self.quats, other.quats]),
-            opacity_logits=np.concatenate([self.opacity_logits, other.opacity_logits]),
-            sh=np.concatenate([pad_sh(self.sh, bands), pad_sh(other.sh, bands)]),
-        )
+        pair = [replace(g, sh=pad_sh(g.sh, bands)) for g in (self, other)]
+        return replace(self, **{name: np.concatenate([getattr(g, name) for g in pair]) for name in ARRAYS})
 
 
 def pad_sh(

@@ -84,10 +84,8 @@ class RemovalJob:
         return self._with_paths(shorten)
 
     def _with_paths(self, change: Callable[[str], str]) -> RemovalJob:
-        changed: dict[str, Any] = {}
-        for name in self.PATHS:
-            value = getattr(self, name)
-            changed[name] = value if value in (None, "none") else change(value)
+        named = {name: getattr(self, name) for name in self.PATHS}
+        changed: dict[str, Any] = {name: change(v) for name, v in named.items() if v not in (None, "none")}
         return replace(self, **changed)
 
 

@@ -61,9 +61,7 @@ def orbit_cameras(
     if not region:
         raise BadInput("orbit: no region to look at; give at least one box")
     axis = _unit(axis)
-    corners = np.concatenate([box.corners() for box in region])
-    centre = (corners.min(0) + corners.max(0)) / 2
-    radius = math.sqrt(((corners - centre) ** 2).sum(1).max())
+    _, centre, radius = _extent(region)
     focal = 0.5 * width / math.tan(math.radians(fov_degrees) / 2)
     half_picture = FILL * min(width, height) / 2
     # where a sphere's outline has that size; unlike size · focal / pixels it stays outside the sphere with wide lenses
@@ -80,6 +78,13 @@ def orbit_cameras(
     return tuple(cameras)
 
 
+def _extent(region: Sequence[Box]) -> tuple[np.ndarray, np.ndarray, float]:
+    """A region's corners [N, 3], their middle [3], and the radius of the sphere round it that holds them."""
+    corners = np.concatenate([box.corners() for box in region])
+    centre = (corners.min(0) + corners.max(0)) / 2
+    return corners, centre, math.sqrt(((corners - centre) ** 2).sum(1).max())
+
+
 def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     """The unit normal, towards the region, of the floor under it; None where no plane is found that it stands clear of.
 
@@ -87,9 +92,7 @@ def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     RANSAC (Fischler & Bolles 1981) with a fixed seed over the solid Gaussians round the region. Of the planes that hold
     at least half as many as the best one the nearest is the floor: an object touches it rather than the walls.
     """
-    corners = np.concatenate([box.corners() for box in region])
-    centre = (corners.min(0) + corners.max(0)) / 2
-    radius = float(np.linalg.norm(corners - centre, axis=1).max())
+    corners, centre, radius = _extent(region)
     means = scene.means.astype(np.float64)
     near = (np.linalg.norm(means - centre, axis=1) < NEARBY * radius) & ~in_region(region, means)
     points = means[near & (scene.opacity_logits > 0)]

@@ -23,12 +23,13 @@ from .steps.light import Relit
 from .view_state import ViewState
 
 T = TypeVar("T")
+SPREAD = 3  # views that are shown of many
 SHOWN = 0.25  # blend weight of what the boxes cut off from which a pixel is marked
 
 
-def spread(items: Sequence[T], count: int = 3) -> list[T]:
+def spread(items: Sequence[T]) -> list[T]:
     """A few of many, evenly."""
-    return [items[k * len(items) // count] for k in range(min(count, len(items)))]
+    return [items[k * len(items) // SPREAD] for k in range(min(SPREAD, len(items)))]
 
 
 def of_targets(views: Sequence[ViewState]) -> list[Picture]:
@@ -92,24 +93,18 @@ def of_reference(completed: Completed, field: MappingField | None) -> list[Pictu
 
 def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Picture]:
     """Filled views: raw, blended, and by which rule."""
-    before = {v.id: v.painted for v in views}
-    return [
-        Picture(
-            "rules",
-            f"Filled view {p.camera_id}",
-            p.pasted(before[p.camera_id]),
-            (p.rule_map(*before[p.camera_id].shape[:2]), p.pasted(before[p.camera_id], p.raw)),
-        )
-        for p in spread(painting.views)
-    ]
+    before, shown = {v.id: v.painted for v in views}, []
+    for p in spread(painting.views):
+        was, title = before[p.camera_id], f"Filled view {p.camera_id}"
+        shown.append(Picture("rules", title, p.pasted(was), (p.rule_map(*was.shape[:2]), p.pasted(was, p.raw))))
+    return shown
 
 
 def of_refinement(asked: ViewRefinement, views: Sequence[ViewState]) -> list[Picture]:
     before = {v.id: v.painted for v in views}
-    return spread(
-        [
-            Picture("refined", f"{a.camera_id} refined: before, after", a.image, (before[a.camera_id],))
-            for a in asked.views
-            if a.image is not None
-        ]
-    )
+    shown = [
+        Picture("refined", f"{a.camera_id} refined: before, after", a.image, (before[a.camera_id],))
+        for a in asked.views
+        if a.image is not None
+    ]
+    return spread(shown)

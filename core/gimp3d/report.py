@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from .files import write_atomically
 from .gaussians import Gaussians
+from .geometry import disparity_of
 from .io.cameras import write_transforms
 from .io.images import write_png
 from .pipeline import Picture, RemovalResult, View, render_bytes
@@ -55,7 +56,6 @@ figcaption{font-size:.85rem;opacity:.8;margin-top:.3rem}
 .flip{position:relative}.flip img+img{position:absolute;inset:0;opacity:0;transition:opacity .15s}
 .flip:hover img+img{opacity:1}
 .book{max-width:720px}.book input{width:100%}
-.pair{display:flex;gap:1rem}.pair figure{flex:1}
 td:has(.bar){width:22%}.bar{background:var(--accent);height:.7rem;border-radius:3px;min-width:2px}
 .score{font-size:1.1rem;display:flex;gap:.8rem;align-items:center}
 .score div{width:12rem;background:var(--edge);border-radius:4px}.score div div{height:.9rem}
@@ -141,25 +141,24 @@ def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
 
 def draw(picture: Picture) -> np.ndarray:
     """A stage's result as a picture, [H, W, 3] uint8."""
+    image, data = picture.image, picture.data
     if picture.kind in ("mask", "chart"):
-        return tinted(picture.image, picture.data[0], (230, 60, 60))
+        return tinted(image, data[0], (230, 60, 60))
     if picture.kind == "shadow":
-        light, lifted = picture.data
-        return np.hstack([picture.image, np.repeat(light[..., None], 3, axis=2), lifted])
-    if picture.kind == "depth":
-        return relief(picture.data[0], picture.data[1])
-    if picture.kind == "fit":
-        return fit_plot(picture.data[0], picture.data[1], picture.data[2])
-    if picture.kind == "mapping":
-        return offset_colours(picture.image, *picture.data)
+        light, lifted = data
+        return np.hstack([image, np.repeat(light[..., None], 3, axis=2), lifted])
     if picture.kind == "refined":
-        return np.hstack([picture.data[0], picture.image])
+        return np.hstack([data[0], image])
     if picture.kind == "rules":
-        marked = picture.image
+        marked = image
         for rule, (_, colour) in RULE_COLOURS.items():
-            marked = tinted(marked, picture.data[0] == rule, colour, 0.35)
-        return np.hstack([picture.data[1], picture.image, marked])
-    return outlined(picture.image, picture.data[0])
+            marked = tinted(marked, data[0] == rule, colour, 0.35)
+        return np.hstack([data[1], image, marked])
+    if picture.kind == "mapping":
+        return offset_colours(image, *data)
+    if picture.kind == "depth":
+        return relief(*data)
+    return fit_plot(*data) if picture.kind == "fit" else outlined(image, data[0])
 
 
 def tinted(
@@ -184,21 +183,16 @@ def relief(
     mask: np.ndarray,  # [H, W] bool, outlined
 ) -> np.ndarray:
     """Depth as colour, shaded like a relief."""
-    disparity = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
-    there = disparity[depth > 0]
-    low, high = np.percentile(there, [2, 98]) if len(there) else (0.0, 1.0)
-    colour = cv2.applyColorMap(
-        (np.clip((disparity - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8),
-        cv2.COLORMAP_VIRIDIS,
-    )[..., ::-1]
-    slope = np.gradient(disparity, axis=0) / max(high - low, 1e-12)
-    shade = np.clip(1 + 12 * slope, 0.6, 1.3)[..., None]
-    shaded = np.where((depth > 0)[..., None], np.clip(colour * shade, 0, 255), 40).astype(np.uint8)
-    return outlined(shaded, mask)
+    disparity, there = disparity_of(depth).astype(np.float64), depth > 0
+    low, high = np.percentile(disparity[there], [2, 98]) if there.any() else (0.0, 1.0)
+    span = max(high - low, 1e-12)
+    levels = (np.clip((disparity - low) / span, 0, 1) * 255).astype(np.uint8)
+    shade = np.clip(1 + 12 * np.gradient(disparity, axis=0) / span, 0.6, 1.3)[..., None]
+    shaded = np.clip(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1] * shade, 0, 255)
+    return outlined(np.where(there[..., None], shaded, 40).astype(np.uint8), mask)
 
 
-@dataclass(frozen=True)
-class FitAxes:
+class FitAxes(NamedTuple):
     """Where a plot shows (prior, disparity): nearly all pairs fill it, outliers stay outside."""
 
     first: np.ndarray  # [2] at its lower left corner
@@ -206,9 +200,9 @@ class FitAxes:
 
     @classmethod
     def around(cls, ring: np.ndarray) -> FitAxes:
-        ends = np.percentile(ring, [1, 99], axis=0)
-        middle, half = ends.mean(0), np.maximum(ends[1] - ends[0], 1e-9) / 2 * 1.1
-        return cls(middle - half, middle + half)
+        low, high = np.percentile(ring, [1, 99], axis=0)
+        half = np.maximum(high - low, 1e-9) / 2 * 1.1
+        return cls((low + high) / 2 - half, (low + high) / 2 + half)
 
     def place(self, points: np.ndarray) -> np.ndarray:
         """Pixels [..., 2] of (prior, disparity)."""
@@ -275,8 +269,8 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
         (s["name"], f"{s['seconds']:.2f} s", _bar(s["seconds"] / longest), f"{s['confidence']:.0%}", s["reason"])
         for s in stages
     )
-    dots = (
-        (f"<span class=dot style='background:rgb{colour}'></span>", words) for words, colour in RULE_COLOURS.values()
+    legend = (
+        f"<span class=dot style='background:rgb{colour}'></span>{words}" for words, colour in RULE_COLOURS.values()
     )
     numbers = (counts | summary.get("selection", {})).items()
     return PAGE.substitute(
@@ -288,12 +282,12 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
         pairs="".join(parts["pairs"]),
         variants=f"<h2>Variants</h2><div class=grid>{''.join(fills)}</div>" if (fills := parts["variants"]) else "",
         flips=_flip_book(parts["flips"]),
-        stages=_table(_rows(".n.n.", timed), "<tr><th>stage<th>time<th><th>confidence<th>what happened</tr>"),
+        stages=_table(".n.n.", timed, ("stage", "time", "", "confidence", "what happened")),
         charts=_charts(result.charts, summary),
         references=_references(result.references),
-        legend="".join(dot + escape(words) for dot, words in dots),
+        legend="".join(legend),
         pictures="".join(parts["pictures"]),
-        counts=_table(_rows(".n", ((k.replace("_", " "), f"{v:,}") for k, v in numbers))),
+        counts=_table(".n", ((k.replace("_", " "), f"{v:,}") for k, v in numbers)),
         settings=escape(json.dumps(summary["settings"], indent=1)),
     )
 
@@ -302,15 +296,13 @@ class _Html(str):
     """Text that is HTML already."""
 
 
-def _rows(kinds: str, rows: Iterable[Sequence[str]]) -> str:
-    """Table rows; the kind of a column is n for numbers, else a dot."""
-    cells = {"n": "<td class=n>", ".": "<td>"}
-    texts = ([cell if isinstance(cell, _Html) else escape(cell) for cell in row] for row in rows)
-    return "".join(f"<tr>{''.join(f'{cells[k]}{t}</td>' for k, t in zip(kinds, row))}</tr>" for row in texts)
-
-
-def _table(rows: str, head: str = "") -> str:
-    return f"<table>{head}{rows}</table>"
+def _table(kinds: str, rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """A table; the kind of a column is n for numbers, else a dot."""
+    lines = ["".join(f"<th>{words}" for words in head)] if head else []
+    for row in rows:
+        cells = (cell if isinstance(cell, _Html) else escape(cell) for cell in row)
+        lines.append("".join(f"<td{' class=n' * (kind == 'n')}>{cell}</td>" for kind, cell in zip(kinds, cells)))
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def _bar(share: float) -> _Html:
@@ -334,7 +326,7 @@ def _verdict(verdict: dict[str, Any] | None) -> str:
     figures = ((n.replace("_", " "), f"{verdict[n]:.3f}", m) for n, m in MEANINGS.items() if verdict[n] is not None)
     return (
         f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{''.join(f'<li>{w}</li>' for w in words[1:])}</ul>"
-        f"<details><summary>What the score is made of</summary>{_table(_rows('.n.', figures))}</details>"
+        f"<details><summary>What the score is made of</summary>{_table('.n.', figures)}</details>"
     )
 
 
@@ -348,34 +340,29 @@ def _flip_book(figures: Sequence[str]) -> str:
 
 def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
     """The hidden surfaces straight on: what photos show of each, and its completed picture."""
-    if not charts:
-        return ""
-    rows = ""
-    for k, (chart, facts) in enumerate(zip(charts, summary["charts"]), 1):
-        figures = _figure(_image(f"chart_{k}.png", "hole"), "What photos show; red: the hole")
-        figures += _figure(_image(f"charts/{k}.png", "completed"), "Completed")
+    rows, figures = [], ""
+    for k, (chart, facts) in enumerate(zip(charts, summary.get("charts", ())), 1):
         numbers = (f"{facts['texels']:,}", f"{facts['hole_texels']:,}", f"{facts['photos_median']:.0f}")
-        rows += _rows("..nnn.", [(f"chart:{k}", facts["kind"], *numbers, chart.reason)])
-        rows += f"<tr><td colspan=6><div class=pair>{figures}</div></td></tr>"
-    return (
-        "<h2>Charts</h2><p>The surfaces behind the object, straight on. To paint one: <code>--reference chart:N "
-        "--reference-image FILE</code>.</p>"
-        + _table(rows, "<tr><th>chart<th>kind<th>texels<th>hole<th>photos of a texel<th>why</tr>")
+        rows.append((f"chart:{k}", facts["kind"], *numbers, chart.reason))
+        figures += _figure(_image(f"chart_{k}.png", "hole"), f"chart:{k}, what photos show; red: the hole")
+        figures += _figure(_image(f"charts/{k}.png", "completed"), f"chart:{k}, completed")
+    table = _table("..nnn.", rows, ("chart", "kind", "texels", "hole", "photos of a texel", "why"))
+    words = (
+        "The surfaces behind the object, straight on. To paint one: <code>--reference chart:N --reference-image FILE"
     )
+    return f"<h2>Charts</h2><p>{words}</code>.</p>{table}<div class=grid>{figures}</div>" if rows else ""
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:
     """Why each reference was chosen: the best views' scores as a table."""
-    tables = ""
+    head, tables = ("view", "score", "", "shows of the hidden surface", "mean cos θ", "detail"), ""
     for choice in choices:
-        shown = [s for k, s in enumerate(choice.scores) if k < MOST_SCORES or s.camera_id == choice.camera_id]
-        names = (
-            _Html(f"<b>{escape(s.camera_id)}</b>") if s.camera_id == choice.camera_id else s.camera_id for s in shown
-        )
-        rows = (
-            (name, f"{s.score:.2f}", _bar(s.score), f"{s.covered:.0%}", f"{s.facing:.2f}", f"{s.detail:.0%}")
-            for name, s in zip(names, shown)
-        )
-        head = "<tr><th>view<th>score<th><th>shows of the hidden surface<th>mean cos θ<th>detail</tr>"
-        tables += f"{_table(_rows('.n.nnn', rows), head)}<p>{len(choice.scores)} candidates</p>"
+        rows = []
+        for k, s in enumerate(choice.scores):
+            chosen = s.camera_id == choice.camera_id
+            name = _Html(f"<b>{escape(s.camera_id)}</b>") if chosen else s.camera_id
+            numbers = (f"{s.score:.2f}", _bar(s.score), f"{s.covered:.0%}", f"{s.facing:.2f}", f"{s.detail:.0%}")
+            if chosen or k < MOST_SCORES:
+                rows.append((name, *numbers))
+        tables += f"{_table('.n.nnn', rows, head)}<p>{len(choice.scores)} candidates</p>"
     return f"<h2>Reference views</h2>{tables}" if tables else ""

@@ -46,6 +46,7 @@ Seed = Annotated[int, Between(0, 2**32 - 1)]
 Variant = Annotated[int, Between(0, 15)]
 SETTING = {float: Between(0, 1_000), int: Between(0, 1_000)}
 ANY = {float: Between(), int: Between()}
+PLAIN: dict[type, str] = {list: "a list", dict: "a mapping", bool: "true or false", str: "a text"}
 
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> Any:
@@ -107,21 +108,16 @@ def checked(
         (one,) = (a for a in arguments if a is not type(None))
         return checked(one, value, where, bounds, extra)
     if origin is list:
-        items = _as(list, value, where, "a list")
-        return [checked(arguments[0], item, where, bounds, extra) for item in items]
+        return [checked(arguments[0], item, where, bounds, extra) for item in _as(list, value, where)]
     if origin is dict:
-        pairs = _as(dict, value, where, "a mapping")
         of_key, of_value = arguments
-        return {checked(of_key, k, where): checked(of_value, v, f"{where}.{k}") for k, v in pairs.items()}
+        pairs = _as(dict, value, where).items()
+        return {checked(of_key, k, where): checked(of_value, v, f"{where}.{k}") for k, v in pairs}
     if kind in (float, int):
         return _number(kind, value, where, bounds[kind])
-    if kind is bool:
-        return _as(bool, value, where, "true or false")
-    if kind is str:
-        return _text(value, where)
     if is_dataclass(kind):
         return _dataclass(kind, value, where, bounds, extra)
-    raise TypeError(f"no reader for {kind}")
+    return _as(kind, value, where)
 
 
 def within(settings: Any, where: str) -> None:
@@ -172,34 +168,24 @@ def _number(kind: type, value: Any, where: str, bounds: Between) -> float | int:
     return kind(value)
 
 
-def _text(value: Any, where: str) -> str:
-    text = _as(str, value, where, "a text")
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        raise BadInput(f"{where}: {shown(text)} is no text that a file can hold") from None
-    return text
-
-
-def _as(kind: type[T], value: Any, where: str, what: str) -> T:
+def _as(kind: type[T], value: Any, where: str) -> T:
     if not isinstance(value, kind):
-        raise BadInput(f"{where}: {what} expected, got {shown(value)}")
+        raise BadInput(f"{where}: {PLAIN[kind]} expected, got {shown(value)}")
+    if isinstance(value, str) and value.encode("utf-8", "ignore").decode() != value:  # surrogates
+        raise BadInput(f"{where}: {shown(value)} is no text that a file can hold")
     return value
 
 
 def _dataclass(kind: Any, value: Any, where: str, bounds: Mapping[type, Between], extra: bool) -> Any:
-    given = _as(dict, value, where, "a mapping")
+    given = _as(dict, value, where)
     unknown = sorted(set(given) - set(kinds(kind)))
     if unknown and not extra:
         raise BadInput(f"{where}: {shown(unknown[0])} is not known")
     members = {}
     for field in fields(kind):
-        needed = field.default is MISSING and field.default_factory is MISSING
-        if given.get(field.name) is None:
-            if needed:
-                raise BadInput(f"{where}: no {field.name}")
-            continue
-        members[field.name] = checked(
-            kinds(kind)[field.name], given[field.name], f"{where}: {field.name}", bounds, extra
-        )
+        name, value = field.name, given.get(field.name)
+        if value is not None:
+            members[name] = checked(kinds(kind)[name], value, f"{where}: {name}", bounds, extra)
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise BadInput(f"{where}: no {name}")
     return kind(**members)

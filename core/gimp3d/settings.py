@@ -26,8 +26,8 @@ def job_settings(job: RemovalJob) -> RemovalSettings:
     if not 0 <= job.seed < 1 << 32:
         raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
     settings = replace(PRESETS[job.preset], inpaint=job.inpaint, depth_prior=job.depth_prior, random_seed=job.seed)
-    settings = replace(settings, refine_views=job.refine_views or "")
-    settings = replace(settings, masks=replace(settings.masks, grow=job.grow))
+    masks = replace(settings.masks, grow=job.grow)
+    settings = replace(settings, refine_views=job.refine_views or "", masks=masks)
     shadow = shadow_of(job.shadow, job.shadow_masks)
     if settings.shadow == "off" and shadow == "mask":
         raise BadInput(f"--shadow mask: the preset {job.preset} leaves shadows alone; use another preset")

@@ -6,6 +6,7 @@ import hmac
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,11 @@ class StageStore:
         self,
         folder: Path,
         key: str,
-        kinds: tuple[type, ...],
         resume: bool,
         settings: Mapping[str, Any] | None = None,  # of the whole removal, as plain values
     ) -> None:
         self.folder, self.key, self.resume = folder, key, resume
         self.settings = json.loads(json.dumps(settings or {}))  # tuples as they come back
-        self.kinds = {kind.__name__: kind for kind in kinds}
         self.secret = user_secret()
 
     def load(self, name: str) -> Any | None:
@@ -72,9 +71,9 @@ class StageStore:
         return self.folder / f"{name.replace(' ', '-')}.npz"
 
     def _encode(self, value: Any, arrays: dict[str, np.ndarray]) -> Any:
-        if is_dataclass(value) and type(value).__name__ in self.kinds:
+        if is_dataclass(value):
             members = {f.name: self._encode(getattr(value, f.name), arrays) for f in fields(value)}
-            return {"kind": type(value).__name__, "fields": members}
+            return {"kind": [type(value).__module__, type(value).__qualname__], "fields": members}
         if isinstance(value, np.ndarray):
             key = f"a{len(arrays)}"
             arrays[key] = value
@@ -98,8 +97,8 @@ class StageStore:
             return tuple(self._decode(v, arrays) for v in value["tuple"])
         if "path" in value:
             return Path(value["path"])
-        members = {k: self._decode(v, arrays) for k, v in value["fields"].items()}
-        return self.kinds[value["kind"]](**members)
+        module, name = value["kind"]  # trusted, as the checksum is right
+        return getattr(import_module(module), name)(**{k: self._decode(v, arrays) for k, v in value["fields"].items()})
 
 
 class SharedStages:

@@ -99,10 +99,7 @@ class RunsChild(Needs):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if RunsChild.running is not None:
-            self.report(
-                {"ERROR"}, one_line(BadInput(f"{RunsChild.running.bl_label} is still running; cancel it first"))
-            )
-            return {"CANCELLED"}
+            return self._failed(BadInput(f"{RunsChild.running.bl_label} is still running; cancel it first"))
         try:
             self.worker = self.start(context)
         except FAILURES as error:

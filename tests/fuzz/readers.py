@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import atexit
 import gzip
+import io
 import json
 import math
 import os
@@ -30,7 +31,7 @@ sys.path[:0] = [str(TESTS), str(TESTS / "core" / "io")]
 from onnx_files import model, pixelwise
 from test_formats import WRITERS, sog_files, some
 
-from gimp3d.box import Box, read_region
+from gimp3d.box import read_region
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.io.cameras import camera_id, read_cameras
@@ -41,7 +42,7 @@ from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d.priors import servers
 from gimp3d.priors.monodepth import _from_file
 from gimp3d.priors.onnx import read_model
-from gimp3d.priors.servers import _Asked, _Automatic, _Comfy, _said, _Server, _workflow
+from gimp3d.priors.servers import _Automatic, _Comfy, _said, _Server, _workflow
 from gimp3d.schema import checked, parse_json
 from gimp3d.settings import job_settings
 from gimp3d.store import StageStore
@@ -161,7 +162,7 @@ def colmap_seeds() -> list[bytes]:
 def read_sog(data: bytes) -> object:
     """A description alone, with good pictures."""
     files = sog_seed()
-    return _from_sog(lambda name, most: data[:most] if name == "meta.json" else files[name][:most], Path("x.sog"))
+    return _from_sog(lambda name: io.BytesIO(data if name == "meta.json" else files[name]), Path("x.sog"))
 
 
 @cache
@@ -182,7 +183,7 @@ def sog_descriptions() -> list[bytes]:
 def read_sog_parts(data: bytes) -> object:
     """All of a SOG's files, as no archive's checksums guard them."""
     files = dict(zip(sog_seed(), data.split(SEPARATOR)))
-    return _from_sog(lambda name, most: files[name][:most], Path("x.sog"))
+    return _from_sog(lambda name: io.BytesIO(files[name]), Path("x.sog"))
 
 
 def spz_inside(name: str) -> Reader:
@@ -224,7 +225,7 @@ class Answers(_Server):
         self.option, self.url, self.seconds = "x", "http://localhost:1", 1.0
         self.document, self.left = document, 9
 
-    def _ask(self, path: str, *_: Any) -> bytes:
+    def ask(self, path: str, *_: Any, **__: Any) -> bytes:
         self.left -= 1
         if not self.left:
             raise BadInput("asked too often")
@@ -238,10 +239,9 @@ def read_answers(data: bytes) -> object:
     if "error" in document:
         return _said(data)
     values = {"prompt": "", "negative": "", "seed": 0, "strength": 1, "checkpoint": ""}
-    asked = _Asked(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
     painting = _Comfy(Answers(document), None) if document.pop("comfy", False) else _Automatic(Answers(document))
     painting.words()
-    return painting.paint(asked)
+    return painting.paint(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
 
 
 def read_depth(name: str) -> Callable[[bytes], object]:
@@ -260,9 +260,7 @@ def onnx_seed() -> list[bytes]:
 
 
 def stage_seed(path: Path) -> None:
-    StageStore(path.parent, "key", (Camera, Box), True).save(
-        path.name, (np.arange(6.0), Camera("a", 4, 3, 5, 5, 2, 1, np.eye(4)))
-    )
+    StageStore(path.parent, "key", True).save(path.name, (np.arange(6.0), Camera("a", 4, 3, 5, 5, 2, 1, np.eye(4))))
     path.with_suffix(".npz").rename(path)
 
 
@@ -303,7 +301,7 @@ READERS = {
         Reader("colmap txt", read_colmap("txt"), lambda: [SEPARATOR.join(COLMAP_TEXTS)]),
         Reader("roi", in_file("r.json", read_region), dumped(BOX, [BOX, BOX]), True),
         Reader("job", in_file("job.json", lambda p: load_job(p.parent)), file_seeds(job_seed), True),
-        Reader("stage", in_file("stage.npz", lambda p: StageStore(p.parent, "key", (Camera, Box), True).load("stage")),
+        Reader("stage", in_file("stage.npz", lambda p: StageStore(p.parent, "key", True).load("stage")),
                file_seeds(stage_seed)),
         Reader("photo png", in_file("p.png", read_photo), picture(".png")),
         Reader("photo png inside", lambda d: in_file("p.png", read_photo)(with_checksums(d)), picture(".png")),

@@ -67,20 +67,13 @@ def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
             name = output_name(camera.id)
             mask = read_mask(scene / "truth" / f"{name}{MASKS['mask']}")
             write_png(out / "render" / f"{name}.png", telea(photo_with_object(scene, camera.id), mask))
+    elif method == "hole open":
+        empty_region(scene, out / "out.ply")
     else:
-        if method == "hole open":
-            empty_region(scene, out / "out.ply")
-        else:
-            job = RemovalJob(
-                scene=str(scene / "scene.ply"),
-                cameras=str(scene / "transforms.json"),
-                roi=str(scene / "roi.json"),
-                out=str(out / "out.ply"),
-                reference=reference.id,
-                reference_image=str(scene / reference.id),
-                preset=method,
-            )
-            added = run_removal(job)["counts"]["added"]
+        ply, cams, roi, picture = (str(scene / n) for n in ("scene.ply", "transforms.json", "roi.json", reference.id))
+        target = str(out / "out.ply")
+        job = RemovalJob(ply, cams, roi, target, reference=reference.id, reference_image=picture, preset=method)
+        added = run_removal(job)["counts"]["added"]
     seconds = time.perf_counter() - start
     if method != "telea":
         render_views(out / "out.ply", scene / "transforms.json", out / "render", split="test")
@@ -93,9 +86,8 @@ def score_renders(scene: Path, renders: Path, reference: str) -> dict[str, float
     folder = Path(output_name(reference)).parent
     row: dict[str, float] = {}
     for key, suffix in MASKS.items():
-        scores = evaluate_folders(
-            renders / folder, scene / folder, scene / "truth" / folder, suffix, (Path(reference).name,)
-        )
+        folders = (renders / folder, scene / folder, scene / "truth" / folder)
+        scores = evaluate_folders(*folders, suffix, (Path(reference).name,))
         row |= {f"{metric} {key}": value for metric, value in scores["mean"].items()}
     return row
 
@@ -128,16 +120,15 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "| scene | method | PSNR mask | SSIM | FLIP | PSNR unseen | SSIM | FLIP | added | seconds |",
         "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    methods = list(dict.fromkeys(r["method"] for r in rows))
-    means = [
-        {"scene": "**mean**", "method": m}
-        | {k: float(np.mean([r[k] for r in rows if r["method"] == m])) for k in (*keys, "added", "seconds")}
-        for m in methods
-    ]
+    means = []
+    for method in dict.fromkeys(r["method"] for r in rows):
+        own = [r for r in rows if r["method"] == method]
+        numbers = {k: float(np.mean([r[k] for r in own])) for k in (*keys, "added", "seconds")}
+        means.append({"scene": "**mean**", "method": method, **numbers})
     for row in [*rows, *means]:
-        numbers = [f"{row[k]:.2f}" if k.startswith("psnr") else f"{row[k]:.3f}" for k in keys]
+        cells = [f"{row[k]:.2f}" if k.startswith("psnr") else f"{row[k]:.3f}" for k in keys]
         extra = [f"{row['added']:.0f}", f"{row['seconds']:.1f}"]
         if row["method"] in BASELINES:
             extra = ["", ""]  # no removal was run: times would compare nothing
-        lines.append(f"| {row['scene']} | {row['method']} | {' | '.join([*numbers, *extra])} |")
+        lines.append(f"| {row['scene']} | {row['method']} | {' | '.join([*cells, *extra])} |")
     return "\n".join(lines)

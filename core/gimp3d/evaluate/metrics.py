@@ -89,11 +89,7 @@ def score(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, fl
 
 
 def evaluate_folders(
-    pred: Path,
-    truth: Path,
-    masks: Path,
-    mask_suffix: str = ".mask.png",
-    exclude: Sequence[str] = (),
+    pred: Path, truth: Path, masks: Path, mask_suffix: str = ".mask.png", exclude: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Scores of every picture that both folders have: {"views": {stem: {psnr, ssim, flip}}, "mean", "warnings"}.
 

@@ -107,8 +107,7 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
         pose = (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist()
         frame = {"file_path": c.id, "split": c.split, **lens, **asdict(c.distortion or Distortion())}
         frames.append({**frame, "transform_matrix": pose, EXACT: c.viewmat.tolist()})
-    document = {"camera_model": "OPENCV", "frames": frames}
-    write_json(Path(path), document)
+    write_json(Path(path), {"camera_model": "OPENCV", "frames": frames})
 
 
 def camera_id(name: Any, where: str) -> str:
@@ -210,11 +209,10 @@ def make_camera(
         raise BadInput(
             f"{where}: no lens has focal lengths {fx:g} and {fy:g} and centre {cx:g}, {cy:g} ({width} px wide)"
         )
-    if distortion is not None:
-        if not np.isfinite(distortion.coefficients).all():
-            raise BadInput(f"{where}: the distortion coefficients are not finite")
-        if not distortion.coefficients.any():
-            distortion = None
+    if distortion is not None and not np.isfinite(distortion.coefficients).all():
+        raise BadInput(f"{where}: the distortion coefficients are not finite")
+    if distortion is not None and not distortion.coefficients.any():
+        distortion = None
     return Camera(camera_id(name, where), width, height, fx, fy, cx, cy, viewmat, split, image, distortion)
 
 
@@ -226,7 +224,7 @@ def refuse_model(model: str, where: str) -> None:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _Frame(Distortion):
     """A frame of a transforms.json, with what the document says of all of them."""
 
     file_path: Any = None
@@ -239,11 +237,6 @@ class _Frame:
     cx: float | None = None
     cy: float | None = None
     camera_angle_x: Any = None  # checked where it is used
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
     k4: float = 0.0
     k5: float = 0.0
     k6: float = 0.0
@@ -337,15 +330,13 @@ def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[C
     for k, given in enumerate(document):
         where = f"{path}, camera {k}"
         entry: _Entry = checked(_Entry, given, where, extra=True)
-        rotation, position, pose = _numbers(entry.rotation), _numbers(entry.position), np.eye(4)
+        rotation, position = _numbers(entry.rotation), _numbers(entry.position)
         if rotation.shape != (3, 3) or position.shape != (3,):
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers")
-        pose[:3, :3], pose[:3, 3] = rotation, position
         name = camera_id(entry.img_name, where)
-        viewmat = _inverted(rigid(pose, where))
-        intrinsics = (entry.fx, entry.fy, entry.width / 2, entry.height / 2)
-        photo = _photo(images or path.parent, name)
-        size = (entry.width, entry.height)
+        viewmat = _inverted(rigid(np.column_stack([rotation, position]), where))
+        size, focal = (entry.width, entry.height), (entry.fx, entry.fy)
+        intrinsics, photo = (*focal, entry.width / 2, entry.height / 2), _photo(images or path.parent, name)
         cameras.append(make_camera(where, name, viewmat, size, intrinsics, None, "train", photo))
     return tuple(cameras)
 
@@ -355,18 +346,16 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
     if model is None:
         raise BadInput(f"{folder} holds no COLMAP model (cameras and images, .bin or .txt)")
     binary = (model / "images.bin").exists()
+    read_lenses, read_poses = (_lenses_bin, _poses_bin) if binary else (_lenses_txt, _poses_txt)
     try:
-        lenses = _colmap_cameras_bin(model) if binary else _colmap_cameras_txt(model)
-        poses = _colmap_images_bin(model) if binary else _colmap_images_txt(model)
+        lenses, poses = read_lenses(model), read_poses(model)
     except OSError as error:
         raise BadInput(f"cannot read the COLMAP model in {model} ({error.strerror})") from None
     except (struct.error, ValueError, IndexError, KeyError, OverflowError) as error:
         raise BadInput(f"the COLMAP model in {model} is damaged ({error})") from None
     if images is None:
-        images = next(
-            (f for f in (folder / "images", folder.parent / "images", folder.parent.parent / "images") if f.is_dir()),
-            folder,
-        )
+        near = (place / "images" for place in (folder, folder.parent, folder.parent.parent))
+        images = next((f for f in near if f.is_dir()), folder)
     cameras = []
     for number, (given, lens, quat, translation) in enumerate(poses):
         name = camera_id(given, f"{model}, image {number}")
@@ -408,24 +397,19 @@ def _data_lines(path: Path) -> list[str]:
     return [line.rstrip("\r") for line in lines if not line.startswith("#")]
 
 
-def _colmap_cameras_txt(model: Path) -> dict[int, Lens]:
+def _lenses_txt(model: Path) -> dict[int, Lens]:
     rows = [line.split() for line in _data_lines(model / "cameras.txt") if line.strip()]
     return {int(r[0]): (r[1], int(r[2]), int(r[3]), [float(v) for v in r[4:]]) for r in rows}
 
 
-def _colmap_images_txt(model: Path) -> list[Pose]:
-    poses = []
+def _poses_txt(model: Path) -> list[Pose]:
     lines = iter(_data_lines(model / "images.txt"))
-    for line in lines:
-        if not line.strip():
-            continue
-        words = line.strip().split(" ", 9)  # the name comes last and may hold spaces
-        poses.append((words[9], int(words[8]), [float(v) for v in words[1:5]], [float(v) for v in words[5:8]]))
-        next(lines, None)  # the image's 2D points, possibly an empty line
-    return poses
+    images = ((line.strip(), next(lines, None)) for line in lines if line.strip())  # and its 2D points, maybe empty
+    words = (image.split(" ", 9) for image, _ in images)  # the name comes last and may hold spaces
+    return [(w[9], int(w[8]), [float(v) for v in w[1:5]], [float(v) for v in w[5:8]]) for w in words]
 
 
-def _colmap_cameras_bin(folder: Path) -> dict[int, Lens]:
+def _lenses_bin(folder: Path) -> dict[int, Lens]:
     data = require_file(folder / "cameras.bin").read_bytes()
     (count,), at, found = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):
@@ -439,17 +423,16 @@ def _colmap_cameras_bin(folder: Path) -> dict[int, Lens]:
     return found
 
 
-def _colmap_images_bin(model: Path) -> list[Pose]:
+def _poses_bin(model: Path) -> list[Pose]:
     data = require_file(model / "images.bin").read_bytes()
     (count,), at, poses = struct.unpack_from("<Q", data), 8, []
     for _ in range(count):
-        pose = struct.unpack_from("<7d", data, at + 4)
-        (lens,) = struct.unpack_from("<i", data, at + 60)
+        *pose, lens = struct.unpack_from("<7di", data, at + 4)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode("utf-8")
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
         if at > len(data):
             raise ValueError("images.bin is truncated")
-        poses.append((name, lens, list(pose[:4]), list(pose[4:])))
+        poses.append((name, lens, pose[:4], pose[4:]))
     return poses

@@ -49,16 +49,17 @@ def read_scene(path: Path | str) -> SplatFile:
     try:
         if path.is_dir() or path.name == "meta.json":
             folder = path if path.is_dir() else path.parent
-            return file_of(_from_sog(_limited(lambda name: require_file(folder / Path(name).name).open("rb")), path))
+            return file_of(_from_sog(lambda name: require_file(folder / Path(name).name).open("rb"), path))
         with require_file(path).open("rb") as f:
             start = f.read(4)
         if start[:3] == b"ply":
-            return file_of(_from_compressed_ply(path)) if _is_compressed(path) else read_ply(path)
+            compressed = any(e.name == "chunk" for e in header_of(path).elements)
+            return file_of(_from_compressed_ply(path)) if compressed else read_ply(path)
         if start == SPZ_MAGIC or start[:2] == b"\x1f\x8b":
             return file_of(_from_spz(path))
         if start == b"PK\x03\x04":
             with zipfile.ZipFile(path) as archive:
-                return file_of(_from_sog(_limited(archive.open), path))
+                return file_of(_from_sog(archive.open, path))
         if path.suffix.lower() == ".splat":
             return file_of(_from_splat(path))
     except OSError as error:
@@ -76,33 +77,21 @@ def _from_splat(path: Path) -> Gaussians:
     rows = np.frombuffer(data, SPLAT_ROW)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scale"])
-    return _gaussians(
-        rows["mean"],
-        log_scales,
-        (rows["quat"].astype(np.float32) - 128) / 128,
-        rows["rgba"][:, 3] / 255,
-        (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0,
-    )
-
-
-def _is_compressed(path: Path) -> bool:
-    return any(e.name == "chunk" for e in header_of(path).elements)
+    quats, colour = (rows["quat"].astype(np.float32) - 128) / 128, rows["rgba"] / 255
+    return _gaussians(rows["mean"], log_scales, quats, colour[:, 3], (colour[:, :3] - 0.5) / SH_C0)
 
 
 def _from_compressed_ply(path: Path) -> Gaussians:
     """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
     header, data = header_of(path), path.read_bytes()
     tables, offset = {}, header.size
-    for element in header.elements:
-        try:
-            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
-        except ValueError as error:  # two properties of one name
-            raise BadInput(f"{path}: a damaged compressed PLY ({error})") from None
-        if offset + element.count * kind.itemsize > len(data):
-            raise BadInput(f"{path} is truncated: element {element.name} is not whole")
-        tables[element.name] = np.frombuffer(data, kind, element.count, offset)
-        offset += element.count * kind.itemsize
     try:
+        for element in header.elements:
+            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+            if offset + element.count * kind.itemsize > len(data):
+                raise BadInput(f"{path} is truncated: element {element.name} is not whole")
+            tables[element.name] = np.frombuffer(data, kind, element.count, offset)
+            offset += element.count * kind.itemsize
         vertex, bounds = tables["vertex"], tables["chunk"]
         if len(bounds) * CHUNK_ROWS < len(vertex):
             raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
@@ -224,24 +213,17 @@ def _spz_quats(packed: np.ndarray) -> np.ndarray:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-Read = Callable[[str, int], bytes]  # a file of a scene by its name, and no more than so many bytes of it
+def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
+    """PlayCanvas SOG, versions 1 and 2: attributes as lossless WebP pictures, described by meta.json."""
 
-
-def _limited(opened: Callable[[str], IO[bytes]]) -> Read:
     def read(name: str, most: int) -> bytes:
         with opened(name) as file:
             return file.read(most)
 
-    return read
-
-
-def _from_sog(read: Read, path: Path) -> Gaussians:
-    """PlayCanvas SOG, versions 1 and 2: attributes as lossless WebP pictures, described by meta.json."""
     try:
         where = f"{path}: meta.json"
-        meta: dict[str, Any] = checked(
-            dict[str, Any], parse_json(read("meta.json", LARGEST_META + 1), where, LARGEST_META), where
-        )
+        document = parse_json(read("meta.json", LARGEST_META + 1), where, LARGEST_META)
+        meta: dict[str, Any] = checked(dict[str, Any], document, where)
         version = int(meta.get("version", 1))
         n = int(meta["count"] if version >= 2 else meta["means"]["shape"][0])
         if n < 0:
@@ -301,9 +283,7 @@ def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     picture = decoded(data, f"{path}: a part of the SOG scene")
     if picture.ndim != 3 or picture.dtype != np.uint8 or picture.shape[2] not in (3, 4):
         raise BadInput(f"{path}: a picture of the SOG scene is of another kind")
-    if picture.shape[2] == 3:
-        return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
-    return cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA if picture.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
 def _unpack(packed: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> np.ndarray:

@@ -41,15 +41,12 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
         picture = (picture.astype(np.uint32) * 255 + 32767) // 65535
     elif picture.dtype != np.uint8:
         picture = np.clip(np.rint(np.nan_to_num(picture.astype(np.float32)) * 255), 0, 255)
-    if picture.ndim == 2:
-        picture = picture[..., None]
-    if picture.shape[2] == 1:
-        picture = picture.repeat(3, axis=2)
-    elif picture.shape[2] == 2:
-        picture = picture[..., :1].repeat(3, axis=2)
-    elif picture.shape[2] == 4:
+    picture = np.atleast_3d(picture)
+    channels = picture.shape[2]
+    if channels == 4:
         picture = picture[..., :3].astype(np.uint32) * picture[..., 3:] // 255
-    return np.ascontiguousarray(picture[..., 2::-1].astype(np.uint8))
+    order = [2, 1, 0] if channels > 2 else [0, 0, 0]  # OpenCV's blue, green, red; or grey, with alpha left out
+    return np.ascontiguousarray(picture[..., order].astype(np.uint8))
 
 
 def decoded(data: bytes, name: str, way: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:

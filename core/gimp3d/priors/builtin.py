@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -52,35 +53,15 @@ def exemplar(view: Unfinished) -> Appearance:
     return Appearance(whole, confidence, words)
 
 
-def telea(view: Unfinished) -> Appearance:
-    """Fast marching (Telea 2004), OpenCV."""
-    return _interpolated(view, "telea", cv2.INPAINT_TELEA)
-
-
-def navier_stokes(view: Unfinished) -> Appearance:
-    """Isophotes continued (Bertalmio 2001), OpenCV."""
-    return _interpolated(view, "ns", cv2.INPAINT_NS)
-
-
-def _interpolated(view: Unfinished, name: str, method: int) -> Appearance:
+def _interpolated(name: str, method: int, view: Unfinished) -> Appearance:
     """By cv2.inpaint, which looks at a few pixels of the hole at the image's border: they hold the nearest colour."""
     rows, cols = nearest_allowed(~view.hole)
     filled = cv2.inpaint(view.image[rows, cols], view.hole.astype(np.uint8), 3, method)
     return Appearance(filled, 0.3, f"interpolated by {name}")
 
 
-def shiftmap(view: Unfinished) -> Appearance:
-    """Shift maps (Pritch 2009), OpenCV's xphoto, which compares Lab colours."""
-    return _xphoto(view, "shiftmap", "INPAINT_SHIFTMAP", cv2.COLOR_RGB2Lab, cv2.COLOR_Lab2RGB)
-
-
-def fsr(view: Unfinished) -> Appearance:
-    """Frequency-selective reconstruction (Genser 2018), OpenCV's xphoto, the fast one."""
-    return _xphoto(view, "fsr", "INPAINT_FSR_FAST", cv2.COLOR_RGB2BGR, cv2.COLOR_BGR2RGB)
-
-
-def _xphoto(view: Unfinished, name: str, method: str, there: int, back: int) -> Appearance:
-    """One of xphoto's methods; their mask marks what is known."""
+def _xphoto(name: str, method: str, there: int, back: int, view: Unfinished) -> Appearance:
+    """One of the methods of OpenCV's xphoto, whose mask marks what is known."""
     if not hasattr(cv2, "xphoto"):
         raise BadInput(f"--inpaint {name} needs OpenCV's contrib modules (opencv-contrib-python-headless)")
     colours = cv2.cvtColor(view.image, there)
@@ -90,10 +71,12 @@ def _xphoto(view: Unfinished, name: str, method: str, there: int, back: int) -> 
     return Appearance(cv2.cvtColor(filled, back), 0.5, f"filled by {name}")
 
 
+telea: Provider = partial(_interpolated, "telea", cv2.INPAINT_TELEA)  # fast marching (Telea 2004)
 PROVIDERS: dict[str, Provider] = {
     "exemplar": exemplar,
     "telea": telea,
-    "ns": navier_stokes,
-    "shiftmap": shiftmap,
-    "fsr": fsr,
+    "ns": partial(_interpolated, "ns", cv2.INPAINT_NS),  # isophotes continued (Bertalmio 2001)
+    # shift maps (Pritch 2009), which compare Lab colours; and frequency-selective reconstruction (Genser 2018)
+    "shiftmap": partial(_xphoto, "shiftmap", "INPAINT_SHIFTMAP", cv2.COLOR_RGB2Lab, cv2.COLOR_Lab2RGB),
+    "fsr": partial(_xphoto, "fsr", "INPAINT_FSR_FAST", cv2.COLOR_RGB2BGR, cv2.COLOR_BGR2RGB),
 }

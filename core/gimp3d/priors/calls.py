@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -53,23 +54,21 @@ def waited(
     BadInput
         If it takes longer than `call.seconds`.
     """
-    done: list[R] = []
-    failed: list[BaseException] = []
+    future: Future[R] = Future()
 
     def run() -> None:
         try:
-            done.append(work())
+            future.set_result(work())
         except BaseException as error:
-            failed.append(error)
+            future.set_exception(error)
 
     thread = threading.Thread(target=run, name=f"gimp3d waits for {who}", daemon=True)
     start = told = time.monotonic()
     thread.start()
     try:
-        while thread.is_alive():
-            thread.join(TICK)
+        while not wait([future], TICK).done:
             now = time.monotonic()
-            if thread.is_alive() and now - start > call.seconds:
+            if now - start > call.seconds:
                 raise BadInput(
                     f"{call.option}: {who} was not done after {call.seconds:g} s and is stopped; allow it more time "
                     "with --set painter_seconds=…"
@@ -80,6 +79,4 @@ def waited(
     except BaseException:
         stop()
         raise
-    if failed:
-        raise failed[0]
-    return done[0]
+    return future.result()

@@ -79,8 +79,7 @@ def run(words: Sequence[str], paths: dict[str, Path], call: Call) -> None:
         If it cannot be started, fails, or takes too long. Then, and if the run is cancelled, it and what it started
         are ended.
     """
-    who, said = words[0], [""]
-    filled = list(words)
+    who, said, filled = words[0], [""], list(words)
     for name, path in paths.items():
         filled = [word.replace(name, str(path)) for word in filled]
     try:

@@ -19,17 +19,9 @@ MODEL = "gemini-2.5-flash-image"  # Nano Banana
 KEYS = ("GEMINI_API_KEY", "GOOGLE_API_KEY")
 # Sizes (width, height) of the pictures that the models answer with, by the aspect ratio that is asked for.
 SIZES = {
-    "1:1": (1024, 1024),
-    "2:3": (832, 1248),
-    "3:2": (1248, 832),
-    "3:4": (864, 1184),
-    "4:3": (1184, 864),
-    "4:5": (896, 1152),
-    "5:4": (1152, 896),
-    "9:16": (768, 1344),
-    "16:9": (1344, 768),
-    "21:9": (1536, 672),
-}
+    "1:1": (1024, 1024), "2:3": (832, 1248), "3:2": (1248, 832), "3:4": (864, 1184), "4:3": (1184, 864),
+    "4:5": (896, 1152), "5:4": (1152, 896), "9:16": (768, 1344), "16:9": (1344, 768), "21:9": (1536, 672),
+}  # fmt: skip
 DOLLARS = {"gemini-2.5-flash-image": 0.039, "gemini-3.1-flash-image-preview": 0.067}  # a picture, by Google's list
 ATTEMPTS = 3  # of a request that the server is too busy for; by the client
 PAUSE = 1.0  # s before the second one, longer before the third

@@ -19,10 +19,9 @@ from ..errors import BadInput
 from ..files import require_file
 from ..io.images import decoded
 from ..solvers.robust import robust_fit
-from . import command, torchscript
+from . import command, onnx, torchscript
 from .calls import Call, one_line, waited
 from .networks import IMAGENET_MEAN, IMAGENET_STD, as_depth, path_and_size
-from .onnx import OnnxModel, read_model
 from .pasting import scaled
 
 KINDS = ("disparity", "depth", "metric")
@@ -111,10 +110,10 @@ def _provider(spec: str, call: Call) -> tuple[Look, str, bool] | None:
         return lambda _, h, w: _from_file(Path(before), h, w), kind, kind != "disparity"
     if name == "command":
         return _by_command(before, call), kind, kind != "disparity"
-    if name == "onnx":
-        return _by_onnx(Path(before), size, call), kind, False
-    model = torchscript.read_model(f"{call.option} torchscript", Path(before))
-    return lambda image, h, w: _answer(model.run, model.who, image, size, call), kind, False
+    if name == "torchscript":
+        return _by_network(torchscript.read_model(f"{call.option} {name}", Path(before)), size, call), kind, False
+    model = onnx.read_model(f"{call.option} {name}", Path(before))
+    return _by_network(model, model.size(model.picture) or size, call), kind, False
 
 
 def relative_disparity(
@@ -185,35 +184,16 @@ def _by_command(text: str, call: Call) -> Look:
     return look
 
 
-def _by_onnx(path: Path, size: tuple[int, int] | None, call: Call) -> Look:
-    model = read_model(f"{call.option} onnx", path)
-    size = declared_size(model) or size
-
-    def run(blob: np.ndarray) -> tuple[np.ndarray, ...]:
-        return model.run({_looking(model): blob})
-
-    return lambda image, h, w: _answer(run, f"{call.option} onnx: {path}", image, size, call)
-
-
-def _answer(
-    run: Callable[[np.ndarray], tuple[np.ndarray, ...]],  # [1, 3, h, w] float32 → what the network answers
-    who: str,
-    image: np.ndarray | None,
-    size: tuple[int, int] | None,
+def _by_network(
+    model: onnx.OnnxModel | torchscript.TorchModel,
+    size: tuple[int, int] | None,  # width, height of what it is shown; None: any will do
     call: Call,
-) -> np.ndarray:
-    """[h, w] float32, a network's answer to a picture."""
-    assert image is not None
-    squeezed = scaled(image, *(size or FREE_SIZE)).astype(np.float32) / 255
-    blob = ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]
-    return as_depth(waited(who.rpartition("/")[2], lambda: run(blob), call, lambda: "looks at the view"), who)
+) -> Look:
+    def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
+        assert image is not None
+        squeezed = scaled(image, *(size or FREE_SIZE)).astype(np.float32) / 255
+        blob = ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]
+        answers = waited(model.path.name, lambda: model.look(blob), call, lambda: "looks at the view")
+        return as_depth(answers, model.who)
 
-
-def declared_size(model: OnnxModel) -> tuple[int, int] | None:
-    """(width, height) of the first input of four axes [N, C, H, W], or None if the model takes any."""
-    return model.size(_looking(model))
-
-
-def _looking(model: OnnxModel) -> str:
-    """The input that takes the picture; a name that no input has lets who runs it say what is wrong."""
-    return next((name for name, dims in model.inputs.items() if len(dims) == 4), next(iter(model.inputs), ""))
+    return look

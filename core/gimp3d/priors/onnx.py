@@ -1,9 +1,7 @@
 """ONNX models: what they expect, and what they answer. ONNX Runtime runs them where it is installed, else OpenCV.
 
-What a model takes is read from its file, by the 45 lines of protocol buffers at the end: OpenCV runs networks and does
-not say what they take. ONNX Runtime says it, but only after it has loaded the weights, and its wheel is 28 MB more for
-every platform and Python; it stays an optional extra, so these lines and OpenCV's way cannot go. They take 0.3 ms for a
-model of 200 MB, and refuse sizes and channels that make no sense before anything is loaded.
+What a model takes is read from its file, by the protocol buffers at the end: OpenCV does not say it, and ONNX Runtime,
+28 MB for every platform and Python, only after it has loaded the weights. Sizes that make no sense are refused at once.
 """
 
 from __future__ import annotations
@@ -56,7 +54,7 @@ def painter(argument: str, call: Call) -> Painter:
         blobs = {name: parts[n].transpose(2, 0, 1)[None] for n, name in channels.items()}
         outputs = waited(path.name, lambda: model.run(blobs), call)
         h, w = mask.shape
-        return scaled(as_picture(outputs[0], f"{who}: {path}"), w, h)  # it was squeezed, whatever the size
+        return scaled(as_picture(outputs[0], model.who), w, h)  # it was squeezed, whatever the size
 
     return Painter(path.name, paint, f"the picture that {path} painted")
 
@@ -65,7 +63,7 @@ def painter(argument: str, call: Call) -> Painter:
 class OnnxModel:
     """A model that was read, not yet run."""
 
-    option: str  # by which it was given, for messages
+    who: str  # for messages: option and path
     path: Path
     data: bytes
     inputs: dict[str, tuple[int, ...]]  # name → axes as declared, 0 = any length
@@ -81,8 +79,17 @@ class OnnxModel:
         dims = self.inputs.get(name, ())
         if len(dims) != 4 or not dims[2] or not dims[3]:
             return None
-        check_size((dims[3], dims[2]), f"{self.option}: {self.path} takes {dims[3]}×{dims[2]} pixels, which")
+        check_size((dims[3], dims[2]), f"{self.who} takes {dims[3]}×{dims[2]} pixels, which")
         return dims[3], dims[2]
+
+    @property
+    def picture(self) -> str:
+        """The input of four axes, that takes the picture; else any, so that who runs it says what is wrong."""
+        return next((name for name, dims in self.inputs.items() if len(dims) == 4), next(iter(self.inputs), ""))
+
+    def look(self, blob: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The outputs to a picture [1, 3, H, W]; raises as `run` does."""
+        return self.run({self.picture: blob})
 
     def run(self, blobs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         """The model's outputs to these inputs ([N, C, H, W] float32).
@@ -95,16 +102,13 @@ class OnnxModel:
         feeds = {name: np.ascontiguousarray(blob, np.float32) for name, blob in blobs.items()}
         runtime = onnx_runtime()
         who = "OpenCV" if runtime is None else "ONNX Runtime"
+        failures = cv2.error if runtime is None else Exception  # ONNX Runtime's have no common base
         try:
             return self._by_opencv(feeds) if runtime is None else self._by_runtime(runtime, feeds)
-        except cv2.error as error:
-            reason = error.err or str(error)
-        except Exception as error:  # ONNX Runtime's have no common base
-            if runtime is None:
-                raise
-            reason = str(error)
+        except failures as error:
+            reason = getattr(error, "err", None) or str(error)
         advice = "export it to a plain ONNX" if runtime else "install onnxruntime, or export it to a plain ONNX"
-        raise BadInput(f"{self.option}: {who} cannot run {self.path} ({one_line(reason, 200)}); {advice}")
+        raise BadInput(f"{self.who}: {who} cannot run it ({one_line(reason, 200)}); {advice}")
 
     def _by_opencv(self, feeds: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         level = cv2.setLogLevel(0)  # silent: its complaints come as exceptions too
@@ -143,7 +147,7 @@ def read_model(option: str, path: Path) -> OnnxModel:
     """
     try:
         data = path.read_bytes()
-        return OnnxModel(option, path, data, _inputs(data))
+        return OnnxModel(f"{option}: {path}", path, data, _inputs(data))
     except OSError as error:
         raise BadInput(f"{option}: cannot read {path} ({error.strerror})") from None
     except (IndexError, ValueError):

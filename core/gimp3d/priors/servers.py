@@ -39,6 +39,7 @@ PROGRESS = "/sdapi/v1/progress?skip_current_image=true"
 MOST_BYTES = 256 << 20  # of an answer
 NO_ANSWER = (AttributeError, LookupError, OverflowError, TypeError, ValueError)  # of JSON that says something else
 PROMPT = "photograph of the empty place, surfaces and textures of the surroundings continued, nothing standing there"
+Values = Mapping[str, Any]  # what a painter is told: prompt, negative, seed, strength, checkpoint
 NEGATIVE = "object, person, text, watermark, frame, blurry"
 
 
@@ -62,16 +63,14 @@ def painter(address: str, call: Call) -> Painter:
         width, height = painted_size(w, h)
         if call.strength == 1:
             image = telea(Unfinished(image, mask)).image  # a trace of what stands there comes through
-        asked = _Asked(
-            scaled(image, width, height),
-            scaled(mask.astype(np.uint8), width, height) > 0,
-            {"prompt": f"{call.prompt}, {PROMPT}" if call.prompt else PROMPT, "negative": NEGATIVE, "seed": seed}
-            | {"strength": call.strength, "checkpoint": checkpoint},
-        )
+        shown, hole = scaled(image, width, height), scaled(mask.astype(np.uint8), width, height) > 0
+        words = f"{call.prompt}, {PROMPT}" if call.prompt else PROMPT
+        values = {"prompt": words, "negative": NEGATIVE, "seed": seed, "strength": call.strength}
+        values |= {"checkpoint": checkpoint}
         work = _Comfy(server, workflow) if server.is_comfy() else _Automatic(server)
         if workflow and isinstance(work, _Automatic):
             raise BadInput(f"{server.option}: {url} is no ComfyUI; workflows are ComfyUI's, leave {more} away")
-        data = waited(server.host, lambda: work.paint(asked), call, work.words, work.stop)
+        data = waited(server.host, lambda: work.paint(shown, hole, values), call, work.words, work.stop)
         answer = resized(decode_image(data, f"what {url} answered"), (height, width), f"the picture from {url}")
         return scaled(answer, w, h)
 
@@ -84,13 +83,6 @@ def painted_size(width: int, height: int) -> tuple[int, int]:
     factor = min(max(1.0, SHORTEST / min(width, height)), LONGEST / max(width, height))
     wide, high = (max(MULTIPLE, round(factor * side / MULTIPLE) * MULTIPLE) for side in (width, height))
     return wide, high
-
-
-@dataclass
-class _Asked:
-    image: np.ndarray  # [h, w, 3] uint8
-    mask: np.ndarray  # [h, w] bool
-    values: dict[str, Any]  # prompt, negative, seed, strength, checkpoint
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
@@ -139,14 +131,10 @@ class _Server:
         )
 
     def get(self, path: str, seconds: float | None = None) -> Any:
-        return self._json(self._ask(path, None, {}, seconds))
-
-    def get_bytes(self, path: str) -> bytes:
-        return self._ask(path, None, {})
+        return self._json(self.ask(path, seconds=seconds))
 
     def post(self, path: str, document: Any, seconds: float | None = None) -> Any:
-        data = json.dumps(document).encode()
-        return self._json(self._ask(path, data, {"Content-Type": "application/json"}, seconds) or b"{}")
+        return self._json(self.ask(path, json.dumps(document).encode(), "application/json", seconds) or b"{}")
 
     def upload(self, path: str, name: str, data: bytes) -> Any:
         """A picture as a form with a file."""
@@ -157,10 +145,10 @@ class _Server:
             "Content-Type: image/png\r\n\r\n"
         )
         body = head.encode() + data + f"\r\n--{border}--\r\n".encode()
-        return self._json(self._ask(path, body, {"Content-Type": f"multipart/form-data; boundary={border}"}))
+        return self._json(self.ask(path, body, f"multipart/form-data; boundary={border}"))
 
-    def _ask(self, path: str, data: bytes | None, headers: Mapping[str, str], seconds: float | None = None) -> bytes:
-        request = urllib.request.Request(self.url + path, data, dict(headers))
+    def ask(self, path: str, data: bytes | None = None, kind: str = "", seconds: float | None = None) -> bytes:
+        request = urllib.request.Request(self.url + path, data, {"Content-Type": kind} if kind else {})
         try:
             with self._opener.open(request, timeout=seconds or self.seconds) as response:
                 answer: bytes = response.read(MOST_BYTES + 1)
@@ -195,12 +183,9 @@ class _Refused(BadInput):
 
 def is_local(host: str) -> bool:
     """Whether a host is this machine by its very name: nothing is looked up."""
-    if host == "localhost":
-        return True
-    try:
+    with suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"
 
 
 @dataclass
@@ -213,16 +198,15 @@ class _Comfy:
     doing: str = "gets the picture"
     stopped: bool = False
 
-    def paint(self, asked: _Asked) -> bytes:
+    def paint(self, image: np.ndarray, mask: np.ndarray, values: Values) -> bytes:
         try:
-            return self._paint(asked)
+            return self._paint({"image": image, "mask": mask}, dict(values))
         except NO_ANSWER as error:
             self.server.misunderstood(f"{type(error).__name__}: {error}")
 
-    def _paint(self, asked: _Asked) -> bytes:
+    def _paint(self, pictures: Mapping[str, np.ndarray], values: dict[str, Any]) -> bytes:
         server = self.server
-        values = dict(asked.values)
-        for name, picture in (("image", asked.image), ("mask", asked.mask)):
+        for name, picture in pictures.items():
             data = encode_png(picture)
             named = f"gimp3d-{hashlib.sha256(data).hexdigest()[:16]}.png"  # the same picture is not kept twice
             answer = server.upload("/upload/image", named, data)
@@ -274,7 +258,7 @@ class _Comfy:
         if not pictures:
             raise BadInput(f"{self.server.option}: the workflow saved no picture; it needs a node Save Image")
         query = {key: pictures[0].get(key, "") for key in ("filename", "subfolder", "type")}
-        return self.server.get_bytes(f"/view?{urllib.parse.urlencode(query)}")
+        return self.server.ask(f"/view?{urllib.parse.urlencode(query)}")
 
     def words(self) -> str:
         return self.doing
@@ -297,12 +281,11 @@ class _Automatic:
 
     server: _Server
 
-    def paint(self, asked: _Asked) -> bytes:
-        height, width = asked.mask.shape
-        values = asked.values
-        image, mask = (base64.b64encode(encode_png(picture)).decode() for picture in (asked.image, asked.mask))
+    def paint(self, image: np.ndarray, mask: np.ndarray, values: Values) -> bytes:
+        height, width = mask.shape
+        shown, hole = (base64.b64encode(encode_png(picture)).decode() for picture in (image, mask))
         fill = 0 if values["strength"] == 1 else 1  # 0: what stands there is blurred away, 1: kept
-        request = {"init_images": [image], "mask": mask, "width": width, "height": height, "resize_mode": 0}
+        request = {"init_images": [shown], "mask": hole, "width": width, "height": height, "resize_mode": 0}
         request |= {"prompt": values["prompt"], "negative_prompt": values["negative"], "seed": values["seed"]}
         request |= {"steps": STEPS, "cfg_scale": GUIDANCE, "denoising_strength": values["strength"]}
         request |= {"mask_blur": SOFT_EDGE, "inpainting_fill": fill, "inpaint_full_res": False}

@@ -27,7 +27,7 @@ class TorchModel:
     who: str  # for messages: option and path
     path: Path
 
-    def run(self, *inputs: np.ndarray) -> tuple[np.ndarray, ...]:
+    def look(self, *inputs: np.ndarray) -> tuple[np.ndarray, ...]:
         """The model's outputs to these inputs (float32).
 
         Raises
@@ -93,7 +93,7 @@ def painter(argument: str, call: Call) -> Painter:
             np.pad(picture, (*more, (0, 0)), mode="symmetric").transpose(2, 0, 1)[None],
             np.pad(hole, more, mode="symmetric")[None, None].astype(np.float32),
         ]
-        answers = waited(model.path.name, lambda: model.run(*inputs), call)
+        answers = waited(model.path.name, lambda: model.look(*inputs), call)
         if not answers:
             raise BadInput(f"{model.who} answers with no picture")
         answer = as_picture(answers[0], model.who)

@@ -17,7 +17,6 @@ from gimp3d.priors.calls import Call
 from gimp3d.priors.monodepth import (
     DepthPrior,
     check_depth_prior,
-    declared_size,
     depth_prior,
     looks,
     relative_disparity,
@@ -156,7 +155,8 @@ def test_a_model_sees_the_normalised_picture_in_its_own_size(tmp_path, height, w
     assert found.kind == (kind[1:] or "disparity") and found.values.shape == (90, 120)
     wanted = answer(image)
     assert np.abs(found.values - wanted)[3:-3, 3:-3].mean() < 0.02 * np.ptp(wanted)
-    assert declared_size(read_model("--depth-prior", path)) == (None if height == "h" else size)
+    declared = read_model("--depth-prior", path)
+    assert declared.size(declared.picture) == (None if height == "h" else size)
 
 
 def scripted(folder, body):

@@ -41,7 +41,7 @@ def test_the_quick_benchmark_writes_results_table_and_chart(tmp_path: Path) -> N
     times = measured(results)
     assert len(times) > 50 and min(times) > 0
     assert 0 < results["blends"][0]["forward"]["share_of_peak"] < 1
-    assert "| 3d | 20k | 480×270 | 1 |" in (tmp_path / "raster.md").read_text()
+    assert "| 3d | 20,000 | 480×270 | 1 |" in (tmp_path / "raster.md").read_text()
     chart = ElementTree.parse(tmp_path / "raster_speed.svg").getroot()
     assert chart.tag.endswith("svg")
     words = {t.text for t in chart.iter("{http://www.w3.org/2000/svg}text")}

@@ -15,7 +15,6 @@ from gimp3d.priors.calls import Call
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
 from gimp3d.store import StageStore
-from gimp3d.stored import STORED
 
 TRUTH, HOLE = scenery(120, 160), disc()
 REFERENCE = scenery(90, 200, seed=1)
@@ -138,8 +137,8 @@ def test_what_was_asked_is_kept_for_resume(tmp_path: Path) -> None:
     done = refine_views(painter(truth), [view()], 0, Call())
     refused = refine_views(painter(lambda right, mask: right[:, ::-1]), [view("b")], 0, Call())
     kept = ViewRefinement(done.views + refused.views, 0.5, "1 of 2")
-    StageStore(tmp_path, "key", STORED, resume=True).save("refine views", kept)
-    found = StageStore(tmp_path, "key", STORED, resume=True).load("refine views")
+    StageStore(tmp_path, "key", resume=True).save("refine views", kept)
+    found = StageStore(tmp_path, "key", resume=True).load("refine views")
     assert found is not None and found.facts() == kept.facts()
     np.testing.assert_array_equal(found.views[0].image, kept.views[0].image)
     assert found.views[1].image is None
