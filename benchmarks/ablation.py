@@ -10,6 +10,7 @@ run goes on; delete it after a change to the core. Writes OUT/ablation.md. Run b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -20,6 +21,7 @@ import numpy as np
 
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.pipeline import PRESETS, RemovalSettings
+from gimp3d.solvers.exemplar import EDGE
 
 from .command import kept, parser_of, say, told_in_one_line, write
 from .scenes import MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
@@ -74,11 +76,13 @@ RULES: dict[str, tuple[Switch, ...]] = {
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
+    "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, 0, 0, 0])),),
     "whole patches vote in the end": (("gimp3d.solvers.exemplar:OWN", 99),),
     "only patches' middle pixels vote": (("gimp3d.solvers.exemplar:OWN", 0),),
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),
+    "dark rims where it stands stay": (("gimp3d.stages.contact:CHANCE", math.inf),),
     "a light need not beat chance": (("gimp3d.stages.light_search:EARNS", 1e-9),),
     "a light need not explain what is uneven": (("gimp3d.stages.light_search:FITS", 1e-9),),
     "a shadow may be missing round the object": (("gimp3d.stages.shadow:FAINT", -1.0),),
