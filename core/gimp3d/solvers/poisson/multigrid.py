@@ -1,7 +1,7 @@
 """Conjugate gradients preconditioned by a geometric multigrid cycle, on the pixels of an irregular hole.
 
-More than 500 lines, as its kernels share one layout of the grids; pyamg, which could stand in, is 15–27 times slower
-(`make bench-poisson`).
+More than 500 lines, as its kernels share one layout of the grids. What could stand in is slower: pyamg 15–27 times
+(`make bench-poisson`), SciPy's sparse LU 40 times at 11,000 pixels and 120 times at 300,000.
 
 A·u = right, where A is a diagonal D less the adjacency of the hole's pixels (4 neighbours): the discrete Poisson
 equation. Multigrid as a preconditioner: Tatebe 1993; on irregular domains: McAdams et al. 2010.
