@@ -27,7 +27,7 @@ class PoissonSettings:
 
     # Residual over that of the guidance plus one constant per component, each equation divided by its diagonal
     tolerance: float = 1e-5
-    # Then a direct solve, as in mazes of one-pixel walls. 5 are usual; 280 among many depth seams, still faster than that
+    # Then a direct solve, as in mazes of one-pixel walls. 5 are usual; 280, among many seams, are still faster
     most_iterations: int = 600
 
 
