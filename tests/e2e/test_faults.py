@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -163,9 +164,12 @@ def test_a_signal_ends_the_program_with_its_code(name: str, code: int, folder: P
     (folder / "out.ply").write_bytes(b"precious")
     before = contents(folder)
     work = "print('at work', flush=True); time.sleep(60)"
-    with start(folder, "--out", folder / "out.ply", work=work, stdout=subprocess.PIPE) as running:
+    number = getattr(signal, name)
+    # a shell's background jobs ignore SIGINT, and what they start does too
+    heard = partial(signal.signal, number, signal.SIG_DFL)
+    with start(folder, "--out", folder / "out.ply", work=work, stdout=subprocess.PIPE, preexec_fn=heard) as running:
         assert running.stdout and running.stdout.readline()
-        running.send_signal(getattr(signal, name))
+        running.send_signal(number)
         said = running.communicate(timeout=20)[1]
     assert running.returncode == code and said.count("\n") == 1 and "nothing was changed" in said, said
     assert contents(folder) == before
