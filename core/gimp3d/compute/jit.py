@@ -59,16 +59,17 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """numba's njit, its cache in the folder of the function's module."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        global _to_announce
         folder = _cache_folder(Path(function.__code__.co_filename))
-        _to_announce |= not folder.exists()
+        if options.get("cache"):
+            _there.setdefault(folder, folder.exists())
         numba.config.CACHE_DIR = str(folder)  # numba looks here when it decorates
         return numba.njit(nogil=True, error_model="numpy", boundscheck=False, **options)(function)
 
     return decorate
 
 
-_to_announce = False
+_there: dict[Path, bool] = {}  # folders of modules whose kernels are kept, and whether they were there at the start
+_announced = False
 kernel = _compiled(cache=True, fastmath=True)
 # For kernels that must see NaN and infinity as such:
 exact_kernel = _compiled(cache=True, fastmath={"contract"})
@@ -77,8 +78,8 @@ inline_kernel = _compiled(fastmath=True, inline="always")
 
 
 def announce_compilation(say: Callable[[str], object] = logging.getLogger("gimp3d").warning) -> None:
-    """Say once, and only where nothing is compiled yet, why the first call takes long."""
-    global _to_announce
-    if _to_announce:
-        _to_announce = False
+    """Say once, and only where most is not compiled yet, why the first call takes long."""
+    global _announced
+    if not _announced and 2 * sum(_there.values()) < len(_there):
         say("first run on this machine: compiling kernels, about a minute")
+    _announced = True
