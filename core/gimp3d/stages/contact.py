@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 from ..geometry import dilated
 from ..srgb import linear
 from .charts import Chart
-from .charts.draw import MIXED as MIXED_TEXELS
 from .ground import Ground
 from .lifting import MIXED
 from .light_search import DARK
@@ -120,6 +119,6 @@ def _taken(level: np.ndarray, hole: np.ndarray, width: float) -> np.ndarray:
     """[H, W] the share of light taken: without steps, and beside the object so much that it is filled."""
     dark = level < 0
     taken = 1 - np.exp(cv2.GaussianBlur(level, (0, 0), width / (2 * STRIPS)))
-    inside = dilated(hole, MIXED_TEXELS) & dilated(dark, round(width))
+    inside = hole & dilated(dark, round(width))
     taken[inside] = np.maximum(taken[inside], TOO_DARK)
     return taken
