@@ -23,7 +23,7 @@ SOFTNESS = (4.0, 10.0, 25.0)  # degrees, σ of lobes of light that are tried
 LOBES = (384, 160, 32)  # directions in which lobes of each softness are tried
 SOFT_RANGE = (0.5, 45.0)  # degrees between which softness is settled
 SAMPLES = 48  # rays to a light
-SKY = 96  # and to the sky
+SKY = 96  # and to the sky, about
 MOST = 3  # lights
 COARSEST, FINEST = 4.0, 1.0  # degrees, first and last step by which lights are settled
 MOST_ROUNDS = 8  # of settling by each step
@@ -60,8 +60,6 @@ class Light:
 
     def rays(self, count: int = SAMPLES) -> np.ndarray:
         """[count, 3] directions, evenly drawn from the lobe (a sunflower's seeds)."""
-        if not math.isfinite(self.softness):
-            return _hemisphere(SKY)
         k = np.arange(count)
         radius = math.radians(self.softness) * np.sqrt(-2 * np.log(1 - (k + 0.5) / count))
         angle = k * math.pi * (3 - math.sqrt(5))
@@ -272,14 +270,25 @@ def _near(light: Light, step: float) -> list[Light]:
 
 def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, light: Light) -> np.ndarray:
     """[N] the share of a light that does not arrive."""
-    rays = light.rays()
-    rays = rays[rays[:, 2] > 0]
-    blocked = occluder.blocked(points, rays)
-    facing = np.ones(len(rays)) if normal is None else _faces(occluder.plane, normal, rays)
-    if not math.isfinite(light.softness):
-        up = rays[:, 2] if normal is None else rays @ (occluder.plane.axes @ normal)
-        facing = facing * np.maximum(up, 0) / max(float(np.maximum(up, 0).mean()), 1e-6)
-    return blocked @ (facing / len(rays)).astype(np.float32)
+    if math.isfinite(light.softness):
+        rays = light.rays()
+        rays = rays[rays[:, 2] > 0]
+        facing = np.ones(len(rays)) if normal is None else _faces(occluder.plane, normal, rays)
+        return occluder.blocked(points, rays) @ (facing / len(rays)).astype(np.float32)
+    rays = _open_sky(occluder.walls)
+    up = rays[:, 2] if normal is None else rays @ (occluder.plane.axes @ normal)
+    facing = np.maximum(up, 0)
+    return occluder.blocked(points, rays) @ (facing / max(float(facing.sum()), 1e-6)).astype(np.float32)
+
+
+def _open_sky(walls: np.ndarray) -> np.ndarray:
+    """[D, 3] directions of the sky that no wall, by its normal [W, 3], hides; D is at least SKY in most corners."""
+    for finer in (1, 2, 4, 8):
+        rays = _hemisphere(finer * SKY)
+        rays = rays[(rays @ walls.T > 0).all(1)]
+        if len(rays) >= SKY:
+            break
+    return rays
 
 
 def _faces(plane: Plane, normal: np.ndarray, rays: np.ndarray) -> np.ndarray:

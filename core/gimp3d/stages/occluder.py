@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,7 @@ SAMPLES = 16  # of every Gaussian, by which it is spread over cells
 FAINT = 0.05  # opacity below which a Gaussian blocks nothing worth telling
 LARGE = 0.25  # of the region's diagonal, from which a Gaussian is no part of an object that size
 LOW = 0.03  # of the diagonal: what is lower is the surface that went along
+LOWEST = 5.0  # percentile of what is removed that is its lowest part; a box cuts into the floor
 STANDS = 0.1  # of the diagonal: an object whose lowest parts are no higher stands on the surface
 STEP = 0.8  # cells that a ray goes at once
 
@@ -29,6 +31,15 @@ def standing(gaussians: Gaussians, plane: Plane, diagonal: float) -> Gaussians:
     return gaussians.take(solid & (height > LOW * diagonal))
 
 
+def support_first(planes: Sequence[Plane], gone: Gaussians) -> list[Plane]:
+    """Planes, first what the object stands on: where its lowest part is nearest to it."""
+
+    def gap(plane: Plane) -> float:
+        return abs(float(np.percentile(plane.local(gone.means.astype(np.float64))[:, 2], LOWEST)))
+
+    return sorted(planes, key=gap)
+
+
 @dataclass(frozen=True)
 class Occluder:
     """What blocks light, in the axes of a plane: x and y along it, z its height."""
@@ -37,10 +48,11 @@ class Occluder:
     low: np.ndarray  # [3] corner of the volume
     cell: float  # side of a cell
     thickness: np.ndarray  # [X, Y, Z] float32: optical depth of a way of one cell's length
+    walls: np.ndarray  # [W, 3] normals of what it stands before, in the plane's axes: no sky is seen behind them
 
     @classmethod
-    def make(cls, gaussians: Gaussians, plane: Plane, diagonal: float) -> Occluder | None:
-        """Of the Gaussians that stand above the plane; None if none does.
+    def make(cls, gaussians: Gaussians, plane: Plane, diagonal: float, others: Sequence[Plane] = ()) -> Occluder | None:
+        """Of the Gaussians that stand above the plane, and before some of the others; None if none does.
 
         A Gaussian blocks as much as an opaque disk of area 2π σ₁ σ₂ · opacity, whichever way it lies.
         """
@@ -68,7 +80,9 @@ class Occluder:
         foot = int(np.ceil((LOW * diagonal - low[2]) / cell))
         if 0 < foot < shape[2] and low[2] < LOW * diagonal:
             thickness[:, :, :foot] = thickness[:, :, foot : foot + 1]  # it stands on the plane: no light goes below
-        return cls(plane, low, cell, thickness)
+        centre = np.median(g.means.astype(np.float64), axis=0, keepdims=True)
+        walls = [o.normal for o in others if o.crosses(plane) and o.local(centre)[0, 2] > 0]
+        return cls(plane, low, cell, thickness, np.reshape(walls, (-1, 3)) @ plane.axes.T)
 
     @cached_property
     def size(self) -> np.ndarray:

@@ -109,7 +109,7 @@ def find_shadow(
     """
     if not planes:
         return "no shadow found: no surface is known that it could fall on"
-    occluder = Occluder.make(gone, planes[0], extent(region))
+    occluder = Occluder.make(gone, planes[0], extent(region), [g.plane for g in grounds])
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
     receivers = [half for half in (Receiver.make(g).halved() for g in grounds) if half.surface.shown.sum() >= FEWEST]

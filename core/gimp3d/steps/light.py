@@ -17,6 +17,7 @@ from ..stages.contact import find_contact
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from ..stages.masks import Masks
+from ..stages.occluder import support_first
 from ..stages.reflection import Reflection, find_reflection
 from ..stages.shadow import Shadow, find_shadow, marked_shadow
 from ..stages.witness import Witness
@@ -66,12 +67,13 @@ def find_light(
     settings: RemovalSettings,
 ) -> Found:
     """Look for the object's reflection, and in photos without that for its shadow."""
-    planes = surfaces.planes
+    gone = scene.take(masks.removed)
+    planes = support_first(surfaces.planes, gone)
     if not planes:
         none = "no surface is known round the object"
         return Found(None, f"no reflection found: {none}", None, f"no shadow found: {none}")
     witnesses: Sequence[Witness] = surfaces.witnesses(views)
-    grounds, gone = look_at(planes, masks.views, witnesses, region), scene.take(masks.removed)
+    grounds = look_at(planes, masks.views, witnesses, region)
     reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
     if isinstance(reflection, Reflection):
         bare = bare_photos(reflection, witnesses)

@@ -180,6 +180,21 @@ def test_a_plane_is_found_from_a_start_that_is_tilted(azimuth: float) -> None:
     assert np.abs(plane.points(x, y)[..., 2]).max() < 0.01 * extent(REGION)
 
 
+def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -> None:
+    def colours(points: np.ndarray) -> np.ndarray:
+        """A wall that is painted almost evenly, above tiles."""
+        tiles = np.floor(points[..., :1] / 0.3) + np.floor(points[..., 1:2] / 0.3)
+        faint = 130 + 0.2 * (texture(points) - 120)
+        return np.where(points[..., 1:2] > 0.399, faint, 120 + 60 * (tiles % 2) + 0.2 * (texture(points) - 120))
+
+    eyes = front_cameras((0.5, 0.8, 1.2))
+    seen = room(eyes, [FLOOR, WALL], noise=0.005, colours=colours)
+    planes = find_planes(seen.views, seen.witnesses, REGION)
+    assert len(planes) == 2
+    for normal, _ in (FLOOR, WALL):
+        assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
+
+
 def test_a_plane_s_axes_are_orthonormal_and_its_coordinates_come_back() -> None:
     plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION).tilted(0.1, 0.2, -0.1)
     axes = np.stack([plane.right, plane.down, plane.normal])

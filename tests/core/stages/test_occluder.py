@@ -9,7 +9,8 @@ from scenes import BLOCK, REGION, block, floor
 
 from gimp3d.box import Box
 from gimp3d.stages.charts import Plane, extent
-from gimp3d.stages.occluder import Occluder
+from gimp3d.stages.light_search import Light, taken_from
+from gimp3d.stages.occluder import Occluder, support_first
 
 UP = np.array([0.0, 0.0, 1.0])
 FLOOR = Plane.make(np.zeros(3), UP, REGION)
@@ -57,6 +58,32 @@ def test_moved_on_the_plane_its_shadow_moves_along() -> None:
     step = 0.3 * FLOOR.right - 0.2 * FLOOR.down
     here, there = occluder().blocked(points, rays), occluder().moved(0.3, -0.2).blocked(points + step, rays)
     np.testing.assert_allclose(here, there, atol=1e-6)
+
+
+def test_the_sky_is_seen_where_no_wall_stands() -> None:
+    """In a corner only the open quarter of the sky gives light, and the object blocks some of that."""
+    walls = [Plane.make(np.array([1.0, 0, 0]), np.array([-1.0, 0, 0]), REGION)]
+    walls.append(Plane.make(np.array([0, 1.0, 0]), np.array([0, -1.0, 0]), REGION))
+    table = Plane.make(np.array([-2.0, 0, 0]), np.array([-1.0, 0, 0]), REGION)  # its edge: the object is behind that
+    made = Occluder.make(cube(BOX, (0.8, 0.1, 0.1)), FLOOR, extent(REGION), [FLOOR, *walls, table])
+    assert made is not None and len(made.walls) == 2
+    points = np.random.default_rng(0).uniform(-0.8, 0.8, (60, 3)) * [1, 1, 0]
+    points = points[(np.abs(points[:, :2]) > BLOCK / 2 + 0.05).any(1)]
+    rays = Lamp(90, 0, np.inf).rays()  # the whole sky, as a level surface weighs it
+    for place, normal in ((points, None), (points, UP)):
+        found = taken_from(made, [Light(UP, np.inf, np.ones(3))], place, normal)[:, 0]
+        for keep, near in ((rays[(rays[:, :2] < 0).all(1)], True), (rays, False)):
+            share = keep[:, 2] if normal is None and near else np.ones(len(keep))
+            true = np.array(
+                [np.average([blocked(p[None], r[None], BOX)[0] for r in keep], weights=share) for p in place]
+            )
+            assert (np.abs(found - true).mean() < 0.04) == near
+
+
+def test_the_support_is_what_the_object_stands_on() -> None:
+    wall = Plane.make(np.array([BLOCK / 2 + 0.1, 0, 0]), np.array([-1.0, 0, 0]), REGION)
+    low = Plane.make(np.array([0, 0, -0.3]), UP, REGION)
+    assert support_first([wall, low, FLOOR], cube(BOX, (0.8, 0.1, 0.1)))[0] is FLOOR
 
 
 def test_what_lies_flat_blocks_nothing() -> None:

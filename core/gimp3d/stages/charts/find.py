@@ -28,7 +28,9 @@ INLIER = 0.03  # diagonals of the region up to which such a point lies on a plan
 MOST = 4  # planes that are tried: a floor, two walls, and one that rough depths make up
 RIVAL = 1.1  # how much better photos must agree on a further plane than on those before it, for the points on it
 LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
-POINTS = 96  # along a side, at which photos are compared at the finest level
+POINTS = 96  # along a side, at which photos are compared at the finest level …
+OWN = 4  # … and one for so many of these that led to the plane: more of them tilt it (two planes on real_bed)
+ONE_SIDED = 0.9  # share of a plane's points that lie on one side of another one if it ends there
 SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sought, and offsets that are tried
 TILT = 0.2  # slope by which it is tilted to begin with: rough depths were 8° off (kitchen_monkey)
 TRIED = 3  # planes of the coarsest level that are followed up
@@ -54,6 +56,13 @@ class _Round:
 
     def take(self, rows: np.ndarray) -> _Round:
         return _Round(self.points[rows], self.eyes[rows], self.weight[rows])
+
+    def some(self, count: int) -> _Round:
+        """At most so many, drawn by what they tell."""
+        if len(self.points) <= count:
+            return self
+        chance = self.weight / self.weight.sum()
+        return self.take(np.sort(np.random.default_rng(0).choice(len(chance), count, replace=False, p=chance)))
 
     def on(self, plane: Plane) -> np.ndarray:
         """[N, 3]: where the same rays meet a plane."""
@@ -108,8 +117,9 @@ def find_planes(
 
     Planes are sought among the points of surface round the object, each counting by the square of the share of views
     in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
-    photos' textures agree best, since the depths of rough splats do not tell; and of two planes that could both be
-    what some pixels show, photos choose as well.
+    photos' textures agree best, since the depths of rough splats do not tell: at the pixels that led to it, and round
+    the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
+    that could both be what some pixels show, photos choose as well.
     """
     diagonal = extent(region)
     around = _surface_round(views, witnesses, region)
@@ -117,14 +127,16 @@ def find_planes(
     textures = levels[-1]
     cameras = np.array([v.camera.centre for v in views])
     rng, left = np.random.default_rng(0), around
-    found: list[tuple[Plane, _Round]] = []
-    while len(found) < MOST:
+    sought: list[tuple[Plane, _Round]] = []
+    while len(sought) < MOST:
         candidate = largest_plane(left.points, left.weight, INLIER * diagonal, cameras, region, rng)
         if candidate is None or left.weight[candidate[1]].sum() < settings.least * around.weight.sum():
             break
         plane, on = candidate
-        found.append((_settled(plane, diagonal, levels), left.take(on)))
+        sought.append((plane, left.take(on)))
         left = left.take(~on)
+    all_planes = [plane for plane, _ in sought]
+    found = [(_settled(plane, own, _bounds(plane, own, all_planes), diagonal, levels), own) for plane, own in sought]
     found.sort(key=lambda f: -textures.agreement(around.on(f[0])))
     planes: list[Plane] = []
     for plane, own in found:
@@ -141,7 +153,20 @@ def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def _settled(plane: Plane, half: float, levels: Sequence[Textures]) -> Plane:
+def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
+    """The planes that a plane ends at, and on which side of them its own points lie: 1 above, −1 below."""
+    bounds = []
+    for other in others:
+        if plane.crosses(other):
+            above = float(own.weight @ (other.local(own.points)[:, 2] > 0) / own.weight.sum())
+            if max(above, 1 - above) > ONE_SIDED:
+                bounds.append((other, 1 if above > 0.5 else -1))
+    return bounds
+
+
+def _settled(
+    plane: Plane, own: _Round, bounds: Sequence[tuple[Plane, int]], half: float, levels: Sequence[Textures]
+) -> Plane:
     """The plane where photos agree best (plane sweep, then a pattern search with tilts: Hooke 1961), coarse to fine.
 
     Coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a compromise of
@@ -151,8 +176,12 @@ def _settled(plane: Plane, half: float, levels: Sequence[Textures]) -> Plane:
     starts = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
     for level, textures in enumerate(levels):
         finest = level == len(levels) - 1
-        x, y = grid(half, POINTS // 2 ** (len(levels) - 1 - level))
-        agreement = partial(_agreement_at, plane, half, x, y, textures)
+        count = POINTS // 2 ** (len(levels) - 1 - level)
+        x, y = (g.ravel() for g in grid(half, count))
+        points, there = plane.points(x, y), np.ones(len(x), bool)
+        for other, side in bounds:
+            there &= side * other.local(points)[:, 2] > 0
+        agreement = partial(_agreement_at, plane, half, x[there], y[there], own.some(count**2 // OWN), textures)
         if level == 0:
             starts = _best_of(agreement, starts, TRIED)
         if finest:
@@ -163,10 +192,12 @@ def _settled(plane: Plane, half: float, levels: Sequence[Textures]) -> Plane:
     return plane.tilted(offset * half, slope_x, slope_y)
 
 
-def _agreement_at(plane: Plane, half: float, x: np.ndarray, y: np.ndarray, textures: Textures, at: np.ndarray) -> float:
+def _agreement_at(
+    plane: Plane, half: float, x: np.ndarray, y: np.ndarray, own: _Round, textures: Textures, at: np.ndarray
+) -> float:
     """Of photos on the plane moved and tilted by `at` [3]: offset over `half`, two slopes."""
-    height = at[0] * half + at[1] * x + at[2] * y
-    return textures.agreement(plane.points(x, y, height).reshape(-1, 3))
+    round_it = plane.points(x, y, at[0] * half + at[1] * x + at[2] * y)
+    return textures.agreement(np.concatenate([round_it, own.on(plane.tilted(at[0] * half, at[1], at[2]))]))
 
 
 def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
