@@ -56,6 +56,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what has its centre in the box is the object": (("masks.selection.by_centre", True),),
     "a membrane behind the object": (("depth.surface", "harmonic"),),
     "smears that only the removal reveals stay": (("masks.selection.support", 0.0),),
+    "planes are settled all round the object": (
+        ("gimp3d.stages.charts.find:OWN", 10**9),
+        ("gimp3d.stages.charts.find:ONE_SIDED", 2.0),
+    ),
     "views' agreement asks no more of photos": (("gimp3d.stages.masks:USUAL_AGREEMENT", 0.0),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),
@@ -93,6 +97,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "depth alone tells what is ground": (("gimp3d.stages.lifting:_shows", _by_depth_alone),),
     "pixels beside the object are lifted": (("gimp3d.stages.lifting:MIXED", 0.3),),
     "the darkest are lifted": (("gimp3d.stages.lifting:DARKEST", 0.05),),
+    "the support is what photos agree on best": (("gimp3d.steps.light:support_first", lambda planes, _: planes),),
+    "walls hide no sky": (
+        ("gimp3d.stages.light_search:_open_sky", Around(lambda sky: lambda _: sky(np.zeros((0, 3))))),
+    ),
     "no walls beside it": (("gimp3d.stages.ground:_walls", lambda *_: []),),
 }
 

@@ -219,12 +219,17 @@ def remove_words(scene: Scene, out: Path) -> list[str]:
     return ["remove", *scene_words(scene), "--out", str(out)]
 
 
+def marked_words(masks: Mapping[str, np.ndarray], folder: Path) -> list[str]:
+    """How a command is told of masks, ID → [H, W] bool, that are filled as well."""
+    marks = folder / "shadows"
+    for name, mask in masks.items():
+        write_png(marks / f"{output_name(name)}.png", mask)
+    return ["--extra-masks", str(marks)]
+
+
 def shadow_words(scene: Scene, folder: Path) -> list[str]:
     """How a command is told of the true shadow: the only place that knows."""
-    marks = folder / "shadows"
-    for camera in scene.train:
-        write_png(marks / f"{output_name(camera.id)}.png", scene.shadow(camera))
-    return ["--extra-masks", str(marks)]
+    return marked_words({c.id: scene.shadow(c) for c in scene.train}, folder)
 
 
 def compile_kernels(scene: Scene, out: Path) -> None:

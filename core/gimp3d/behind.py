@@ -18,8 +18,8 @@ from .steps.light import NOT_LIT, Found, Relit, find_light, undo_light, with_con
 from .steps.surfaces import Charted, chart_surfaces, find_surfaces
 from .view_state import ViewState
 
-# Stages that know nothing of fills.
-BEFORE_FILL = ("masks", "exposure", "surfaces", "light", "lift", "charts", "contact", "lift 2", "charts 2")
+LIGHT = ("light", "lift", "contact", "lift 2", "charts 2")  # stages that a removal with --shadow off lacks
+BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT)  # stages that know nothing of fills
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,8 @@ def find_planes(
     in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
     photos' textures agree best, since the depths of rough splats do not tell: at the pixels that led to it, and round
     the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
-    that could both be what some pixels show, photos choose as well.
+    that could both be what some pixels show, or that go through each other like one surface seen roughly, photos
+    choose as well.
     """
     diagonal = extent(region)
     around = _surface_round(views, witnesses, region)
@@ -140,10 +141,18 @@ def find_planes(
     found.sort(key=lambda f: -textures.agreement(around.on(f[0])))
     planes: list[Plane] = []
     for plane, own in found:
+        if any(_cuts(plane, other, diagonal) for other in planes):
+            continue
         before = max((textures.agreement(own.on(p)) for p in planes), default=-math.inf)
         if textures.agreement(own.on(plane)) >= RIVAL * before:
             planes.append(plane)
     return tuple(planes)
+
+
+def _cuts(plane: Plane, other: Plane, diagonal: float) -> bool:
+    """Whether two planes go through each other near the object at a flat angle: they are one surface, seen roughly."""
+    heights = other.local(plane.points(*grid(diagonal / 2, 2)).reshape(-1, 3))[:, 2]
+    return not plane.crosses(other) and bool(heights.min() < 0 < heights.max())
 
 
 def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
