@@ -18,6 +18,7 @@ from ..geometry import Window, cropped, pack_camera, project
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUD = 127  # grey levels beyond which a difference counts no more; kept as int8
 AT_ONCE = 8  # views whose results are in memory together
+SUBPIXEL = 256  # steps of a pixel in which photos are read
 AGREEING = 3  # photos that must show a point for their agreement to be asked
 
 T = TypeVar("T")
@@ -170,7 +171,8 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
         for k in range(len(cameras)):
             c = cameras[k]
             u, v, _ = project(c, x, y, w)
-            u, v = u - 0.5, v - 0.5
+            # to 1/256 px: a ray through a pixel's centre must not fall to either side of it by rounding
+            u, v = round((u - 0.5) * SUBPIXEL) / SUBPIXEL, round((v - 0.5) * SUBPIXEL) / SUBPIXEL
             width, height = int(c[16]), int(c[17])
             if not (0 <= u < width - 1 and 0 <= v < height - 1):
                 continue

@@ -14,7 +14,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
-from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find_planes, first_hits
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find, find_planes, first_hits
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Witness, ask
 
@@ -193,6 +193,23 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
     assert len(planes) == 2
     for normal, _ in (FLOOR, WALL):
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
+
+
+@pytest.mark.parametrize(
+    ("height", "degrees", "one_surface"),
+    [
+        pytest.param(0.02, 6, True, id="through each other"),
+        pytest.param(0.3, 0, False, id="a step"),
+        pytest.param(0.3, 6, False, id="they meet far away"),
+        pytest.param(0.0, 60, False, id="a slope that the floor ends at"),
+    ],
+)
+def test_planes_that_go_through_each_other_at_a_flat_angle_are_one_surface(
+    height: float, degrees: float, one_surface: bool
+) -> None:
+    floor = Plane.make(np.zeros(3), UP, REGION)
+    other = floor.tilted(height, np.tan(np.radians(degrees)), 0)
+    assert find._cut(floor, other, extent(REGION)) == find._cut(other, floor, extent(REGION)) == one_surface
 
 
 def test_a_plane_s_axes_are_orthonormal_and_its_coordinates_come_back() -> None:

@@ -137,11 +137,11 @@ def find_planes(
         sought.append((plane, left.take(on)))
         left = left.take(~on)
     all_planes = [plane for plane, _ in sought]
-    found = [(_settled(plane, own, _bounds(plane, own, all_planes), diagonal, levels), own) for plane, own in sought]
-    found.sort(key=lambda f: -textures.agreement(around.on(f[0])))
+    found = [(*_settled(plane, own, _bounds(plane, own, all_planes), diagonal, levels), own) for plane, own in sought]
+    found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
-    for plane, own in found:
-        if any(_cuts(plane, other, diagonal) for other in planes):
+    for _, plane, own in found:
+        if any(_cut(plane, other, diagonal) for other in planes):
             continue
         before = max((textures.agreement(own.on(p)) for p in planes), default=-math.inf)
         if textures.agreement(own.on(plane)) >= RIVAL * before:
@@ -149,8 +149,8 @@ def find_planes(
     return tuple(planes)
 
 
-def _cuts(plane: Plane, other: Plane, diagonal: float) -> bool:
-    """Whether two planes go through each other near the object at a flat angle: they are one surface, seen roughly."""
+def _cut(plane: Plane, other: Plane, diagonal: float) -> bool:
+    """Whether planes go through each other near the object at a flat angle: they are one surface, seen roughly."""
     heights = other.local(plane.points(*grid(diagonal / 2, 2)).reshape(-1, 3))[:, 2]
     return not plane.crosses(other) and bool(heights.min() < 0 < heights.max())
 
@@ -175,14 +175,16 @@ def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Pl
 
 def _settled(
     plane: Plane, own: _Round, bounds: Sequence[tuple[Plane, int]], half: float, levels: Sequence[Textures]
-) -> Plane:
-    """The plane where photos agree best (plane sweep, then a pattern search with tilts: Hooke 1961), coarse to fine.
+) -> tuple[float, Plane]:
+    """The plane where photos agree best, and how much: plane sweeps, then pattern searches with tilts (Hooke 1961).
 
-    Coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a compromise of
-    several surfaces: the fine level also starts from a sweep of its own.
+    Coarse to fine: coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a
+    compromise of several surfaces, so every level also starts anew, the finest from offsets only.
     """
     sweep, tilts = np.linspace(-1, 1, SWEEP) * SEARCH, (-TILT, 0.0, TILT)
-    starts = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
+    anywhere = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
+    best, at = 0.0, np.zeros(3)
+    reached: list[np.ndarray] = []
     for level, textures in enumerate(levels):
         finest = level == len(levels) - 1
         count = POINTS // 2 ** (len(levels) - 1 - level)
@@ -191,14 +193,11 @@ def _settled(
         for other, side in bounds:
             there &= side * other.local(points)[:, 2] > 0
         agreement = partial(_agreement_at, plane, half, x[there], y[there], own.some(count**2 // OWN), textures)
-        if level == 0:
-            starts = _best_of(agreement, starts, TRIED)
-        if finest:
-            starts = [*starts, *_best_of(agreement, [np.array([o, 0.0, 0.0]) for o in sweep], 1)]
-        found = [_climbed(agreement, start, FINE_STEP if finest else COARSE_STEP) for start in starts]
-        starts = [max(found, key=lambda f: f[0])[1]]
-    offset, slope_x, slope_y = starts[0]
-    return plane.tilted(offset * half, slope_x, slope_y)
+        anew = ([np.array([o, 0.0, 0.0]) for o in sweep], 1) if finest else (anywhere, TRIED)
+        starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
+        best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
+        reached = [at]
+    return best, plane.tilted(at[0] * half, at[1], at[2])
 
 
 def _agreement_at(
