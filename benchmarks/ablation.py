@@ -82,8 +82,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
     "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, 0, 0, 0])),),
-    "whole patches vote in the end": (("gimp3d.solvers.exemplar:OWN", 99),),
-    "only patches' middle pixels vote": (("gimp3d.solvers.exemplar:OWN", 0),),
+    "averages of patches stay": (("gimp3d.solvers.exemplar:COPIED", 0.0), ("gimp3d.solvers.exemplar:MOSAICS", 0)),
+    "what is copied is not matched again": (("gimp3d.solvers.exemplar:MOSAICS", 0),),
+    "votes have no say in the mosaic": (("gimp3d.solvers.exemplar:COPIED", 1.0),),
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),

@@ -1,7 +1,8 @@
 """Filling a hole in a picture with the picture's own texture, without learned weights.
 
 Patches and colours are found in turns, from coarse to fine (Wexler 2007; Newson 2014 and 2017, whose texture
-features keep a hole in a detailed texture from being filled with flat patches).
+features keep a hole in a detailed texture from being filled with flat patches). In the end every pixel is copied from
+one place: an average of what disagrees is smooth.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ from .patchmatch import (
 )
 from .poisson import solve_hole
 from .regularity import continue_regularly, find_motions
+from .shift_map import shift_map
 from .surface import TangentPlanes, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
-OWN = 4  # px from its centre to which a patch votes in the end: whole ones, averaged, blur what they differ in …
+COPIED = 0.5  # of the filled picture's gradients is as copied, the rest as patches vote: more is sharper, and noisier
+MOSAICS = 8  # rounds that match what is copied: what is like votes, which are smooth, is smooth as well
 TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
@@ -137,12 +140,11 @@ def _by_patches(
         shape = open_.shape[::-1]
         barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
         rounds = 1 if number else settings.coarse_rounds
-        finest = number == len(levels) - 1
-        # … but the average is what makes up for their resampling where they are warped along a surface.
-        reach = min(radius, OWN) if finest and surface is None else radius
         guide = guide_of(edges, open_.shape, 2 ** (len(levels) - 1 - number), max(radius, 1))
-        level = _prepared(channels, open_, barred, GUIDE * guide, there, radius, reach, settings)
-        colours, field = _filled(level, field, rounds, settings)
+        level = _prepared(channels, open_, barred, GUIDE * guide, there, radius, settings)
+        # patches that are warped along a surface are resampled: votes make up for that
+        mosaics = MOSAICS if surface is None and number == len(levels) - 1 else 0
+        colours, field = _filled(level, field, rounds, mosaics, settings)
     assert field is not None
     return level, field, colours
 
@@ -160,7 +162,6 @@ class _Level:
     trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
     surface: TangentPlanes | None
     radius: int
-    reach: int  # px from its centre to which a patch votes
 
 
 def _prepared(
@@ -170,7 +171,6 @@ def _prepared(
     edges: np.ndarray,
     surface: TangentPlanes | None,
     radius: int,
-    reach: int,
     settings: ExemplarSettings,
 ) -> _Level:
     touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
@@ -185,11 +185,11 @@ def _prepared(
         allowed = whole
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
     trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, edges, touching, usable, allowed, trust, surface, radius, reach)
+    return _Level(channels, hole, edges, touching, usable, allowed, trust, surface, radius)
 
 
 def _filled(
-    level: _Level, coarser: NearestNeighbourField | None, rounds: int, settings: ExemplarSettings
+    level: _Level, coarser: NearestNeighbourField | None, rounds: int, mosaics: int, settings: ExemplarSettings
 ) -> tuple[np.ndarray, NearestNeighbourField]:
     """The hole's channels [N, 5] and the field of one level.
 
@@ -218,20 +218,38 @@ def _filled(
         colours = _voted(level, field, level.trust, level.channels[hole])
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     penalty = np.float32(settings.locality / hole.shape[1]) * away
-    for number in range(rounds):
+
+    def matched(
+        field: NearestNeighbourField, colours: np.ndarray, number: int
+    ) -> tuple[NearestNeighbourField, np.ndarray]:
         repaint(patches, colours[:, :3])
         guides[hole] = colours[:, 3:]
-        matching = replace(matching, seed=settings.seed + 31 * number)
         field = refined(
-            field, patches, level.touching, allowed, matching, penalty, index, np.dstack([guides, level.edges]),
-            level.surface, level.usable, reach, tree_sweeps=1,
+            field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,
+            index, np.dstack([guides, level.edges]), level.surface, level.usable, reach, tree_sweeps=1,
         )  # fmt: skip
-        voted = _voted(level, field, _say(level, field), colours)
+        return field, _voted(level, field, _say(level, field), colours)
+
+    for number in range(rounds):
+        field, voted = matched(field, colours, number)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
         if change < settings.settled:
             break
+    for number in range(mosaics):
+        sources = _sources(level, field, colours)
+        there = sources.found[hole]
+        copied = np.where(there[:, None], level.channels[sources.rows[hole], sources.cols[hole]], colours)
+        centres = sources.found
+        centres[centres] = allowed[sources.rows[centres], sources.cols[centres]]
+        field, colours = matched(replace(sources, rows=np.where(centres, sources.rows, -1)), copied, rounds + number)
     return colours, field
+
+
+def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> NearestNeighbourField:
+    picture = level.channels[..., :3].copy()
+    picture[level.hole] = colours[:, :3]
+    return shift_map(picture, level.hole, level.usable, field)
 
 
 def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
@@ -242,17 +260,19 @@ def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
 
 
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
-    """The hole's colours [N, 3] without seams: the gradients that the patches vote for, fixed at the rim.
+    """The hole's colours [N, 3] without seams: the gradients of what is copied, fixed at the rim.
 
-    Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Rim pixels that the patches do not
-    agree with at all, such as remains of what was removed, do not spread.
+    Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Patches vote for gradients as well;
+    unless they are warped along a surface, what the two pixels are copied from has its say. Rim pixels that the
+    patches do not agree with at all, such as remains of what was removed, do not spread.
     """
     rows, cols = np.nonzero(level.hole)
     box = np.s_[max(0, rows.min() - 1) : rows.max() + 2, max(0, cols.min() - 1) : cols.max() + 2]
-    hole = level.hole[box]
+    hole, corner = level.hole[box], np.array([b.start for b in box])
     picture = level.channels[box][..., :3].copy()
     picture[hole] = colours[:, :3]
     say = _say(level, field)
+    sources = _sources(level, field, colours) if level.surface is None else None
 
     def wanted(where: np.ndarray, otherwise: np.ndarray, step: tuple[int, int] = (0, 0)) -> np.ndarray:
         whole = np.zeros(level.hole.shape, bool)
@@ -269,9 +289,28 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
         across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
         across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
         slope[across] = wanted(across, slope[across], (dy, dx))
+        if sources is not None:
+            copied = _copied_steps(level, sources, np.argwhere(across) + corner, (dy, dx))
+            slope[across] += COPIED * (copied - slope[across])
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
     return solve_hole(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values
+
+
+def _copied_steps(
+    level: _Level, sources: NearestNeighbourField, places: np.ndarray, step: tuple[int, int]
+) -> np.ndarray:
+    """[N, 3]: differences to the next pixel where places [N, 2] are copied from, and where those next to them are."""
+    picture, sides = level.channels[..., :3], []
+    for back in (np.zeros(2, int), np.array(step)):
+        y, x = (places + back).T
+        found = sources.found[y, x, None]
+        source = np.where(found, np.stack([sources.rows[y, x], sources.cols[y, x]], 1), places + back) - back
+        after = source + step
+        inside = (source >= 0).all(1) & (after < picture.shape[:2]).all(1)
+        source, after = (np.where(inside[:, None], s, places) for s in (source, after))
+        sides.append(picture[after[:, 0], after[:, 1]] - picture[source[:, 0], source[:, 1]])
+    return np.asarray((sides[0] + sides[1]) / 2)
 
 
 def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
@@ -342,7 +381,7 @@ def _voted(
     weights = np.zeros(level.hole.shape)
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
     voted = otherwise.astype(np.float32)
-    parts = level.channels, places, *step, field.rows, field.cols, weights, level.reach
+    parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius
     if level.surface is None:
         run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
     else:
@@ -354,7 +393,6 @@ def _voted(
             _vote_slanted,
             len(places),
             *parts,
-            level.radius,
             level.usable,
             number,
             support,
@@ -366,7 +404,7 @@ def _voted(
 
 
 @kernel
-def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, reach, voted):
+def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
     h, w, _ = channels.shape
     count, differs = voted.shape[1], dy + dx > 0
     sums = np.empty(count)
@@ -374,8 +412,8 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, reach, voted):
         y, x = places[k]
         total = 0.0
         sums[:] = 0.0
-        for a in range(max(0, y + dy - reach), min(h, y + reach + 1)):
-            for b in range(max(0, x + dx - reach), min(w, x + reach + 1)):
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
                 weight = weights[a, b]
                 if weight > 0.0:
                     v, u = rows[a, b] + y - a, cols[a, b] + x - b
@@ -393,7 +431,7 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, reach, voted):
 
 @kernel
 def _vote_slanted(
-    lo, hi, channels, places, dy, dx, rows, cols, weights, reach, radius, usable, number, support, warp, voted
+    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, number, support, warp, voted
 ):  # fmt: skip
     """Only pixels on the surface of a patch's centre; colours between four pixels of which all may be copied."""
     h, w, _ = channels.shape
@@ -404,8 +442,8 @@ def _vote_slanted(
         y, x = places[k]
         total = 0.0
         sums[:] = 0.0
-        for a in range(max(0, y + dy - reach), min(h, y + reach + 1)):
-            for b in range(max(0, x + dx - reach), min(w, x + reach + 1)):
+        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
+            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
                 n, votes = number[a, b], weights[a, b] > 0.0
                 one[:] = 0.0
                 for end in range(ends):

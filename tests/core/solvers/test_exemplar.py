@@ -22,10 +22,18 @@ def test_edges_are_continued_within_two_pixels(name: str) -> None:
     assert edge_error(filled(name), *PICTURES[name]) < 2
 
 
-@pytest.mark.parametrize("name", ["bricks", "book row", "corner"])  # of those in which it matters at all
+@pytest.mark.parametrize("name", ["bricks", "book row"])  # of those in which it matters at all
 def test_the_seed_hardly_matters(name: str) -> None:
     truth, hole = PICTURES[name]
     assert np.std([psnr(filled(name, seed), truth, hole) for seed in range(4)]) < 0.3
+
+
+def test_a_corner_s_tip_is_where_it_belongs_whatever_the_seed() -> None:
+    """A pixel of it is 1 dB; with averaged patches the best of six seeds came to 31.3."""
+    truth, hole = PICTURES["corner"]
+    for seed in range(4):
+        assert edge_error(filled("corner", seed), truth, hole) < 2
+        assert psnr(filled("corner", seed), truth, hole) > 31.3
 
 
 def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
