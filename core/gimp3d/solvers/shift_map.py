@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from ..compute.jit import kernel
+from ..compute.jit import exact_kernel, kernel
 from .patchmatch import NearestNeighbourField
 
 SEAM = 1.0  # of a seam's squared differences beside those of a pixel from what patches vote for
@@ -44,7 +44,7 @@ def shift_map(
     return replace(field, rows=rows.astype(np.int32), cols=cols.astype(np.int32))
 
 
-@kernel
+@exact_kernel
 def _lower(places, picture, sources, votes, usable, free, shift_y, shift_x):
     h, w, _ = picture.shape
     tried_y, tried_x = np.empty(9, np.int64), np.empty(9, np.int64)

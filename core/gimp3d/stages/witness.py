@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
-from ..compute.jit import exact_kernel, kernel
+from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import Window, cropped, pack_camera, project
 
@@ -163,7 +163,7 @@ class Textures:
         return energy
 
 
-@kernel
+@exact_kernel  # points may be NaN
 def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
     for i in range(lo, hi):
         x, y, w = points[i, 0], points[i, 1], points[i, 2]
@@ -172,7 +172,7 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
             c = cameras[k]
             u, v, _ = project(c, x, y, w)
             # to 1/256 px: a ray through a pixel's centre must not fall to either side of it by rounding
-            u, v = round((u - 0.5) * SUBPIXEL) / SUBPIXEL, round((v - 0.5) * SUBPIXEL) / SUBPIXEL
+            u, v = np.rint((u - 0.5) * SUBPIXEL) / SUBPIXEL, np.rint((v - 0.5) * SUBPIXEL) / SUBPIXEL
             width, height = int(c[16]), int(c[17])
             if not (0 <= u < width - 1 and 0 <= v < height - 1):
                 continue
