@@ -247,6 +247,7 @@ def _filled(
 
 
 def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> NearestNeighbourField:
+    """Where each of the hole's pixels is copied from; no patch's centre, so nothing may be voted with it."""
     picture = level.channels[..., :3].copy()
     picture[level.hole] = colours[:, :3]
     return shift_map(picture, level.hole, level.usable, field)
