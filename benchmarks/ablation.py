@@ -60,7 +60,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:OWN", 10**9),
         ("gimp3d.stages.charts.find:ONE_SIDED", 2.0),
     ),
-    "planes may go through each other": (("gimp3d.stages.charts.find:_cut", lambda *_: False),),
+    "planes stay where their own pixels settled": (
+        ("gimp3d.stages.charts.find:_best_known", lambda claim, plane, best, *_: (best, plane)),
+    ),
     "views' agreement asks no more of photos": (("gimp3d.stages.masks:USUAL_AGREEMENT", 0.0),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),

@@ -16,7 +16,7 @@ from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find, find_planes, first_hits
 from gimp3d.stages.masks import ViewMasks
-from gimp3d.stages.witness import Says, Witness, ask
+from gimp3d.stages.witness import Says, Textures, Witness, ask
 
 FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset
 WALL = (np.array([0.0, -1, 0]), -0.4)
@@ -195,21 +195,25 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
 
 
-@pytest.mark.parametrize(
-    ("height", "degrees", "one_surface"),
-    [
-        pytest.param(0.02, 6, True, id="through each other"),
-        pytest.param(0.3, 0, False, id="a step"),
-        pytest.param(0.3, 6, False, id="they meet far away"),
-        pytest.param(0.0, 60, False, id="a slope that the floor ends at"),
-    ],
-)
-def test_planes_that_go_through_each_other_at_a_flat_angle_are_one_surface(
-    height: float, degrees: float, one_surface: bool
-) -> None:
+def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(floor_room: Room) -> None:
     floor = Plane.make(np.zeros(3), UP, REGION)
-    other = floor.tilted(height, np.tan(np.radians(degrees)), 0)
-    assert find._cut(floor, other, extent(REGION)) == find._cut(other, floor, extent(REGION)) == one_surface
+    guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)
+    textures = Textures.make(floor_room.witnesses)
+    around = find._surface_round(floor_room.views, floor_room.witnesses, REGION)
+    claim = find._Claim(guess, around, [], extent(REGION))
+    elsewhere = claim.agreement(textures)(np.zeros(3))
+    agreement, plane = find._best_known(claim, guess, elsewhere, [guess, floor], textures)
+    assert agreement > 2 * elsewhere and plane.normal @ UP > np.cos(np.radians(0.2))
+    assert find._best_known(claim, floor, agreement, [floor, guess], textures) == (agreement, floor)
+
+
+def test_a_claim_s_pose_leads_to_the_plane() -> None:
+    plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION)
+    claim = find._Claim(plane, find._Round(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
+    other = plane.tilted(0.1, 0.2, -0.1)
+    x, y = np.random.default_rng(3).normal(size=(2, 20))
+    reached = claim.at(claim.pose_of(other))
+    np.testing.assert_allclose(other.local(reached.points(x, y))[:, 2], 0, atol=1e-12)
 
 
 def test_a_plane_s_axes_are_orthonormal_and_its_coordinates_come_back() -> None:

@@ -119,8 +119,7 @@ def find_planes(
     in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
     photos' textures agree best, since the depths of rough splats do not tell: at the pixels that led to it, and round
     the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
-    that could both be what some pixels show, or that go through each other like one surface seen roughly, photos
-    choose as well.
+    that could both be what some pixels show photos choose as well.
     """
     diagonal = extent(region)
     around = _surface_round(views, witnesses, region)
@@ -137,22 +136,16 @@ def find_planes(
         sought.append((plane, left.take(on)))
         left = left.take(~on)
     all_planes = [plane for plane, _ in sought]
-    found = [(*_settled(plane, own, _bounds(plane, own, all_planes), diagonal, levels), own) for plane, own in sought]
+    claims = [_Claim(plane, own, _bounds(plane, own, all_planes), diagonal) for plane, own in sought]
+    found = [(*_settled(claim, levels), claim) for claim in claims]
+    found = [(*_best_known(claim, plane, best, [p for _, p, _ in found], textures), claim) for best, plane, claim in found]
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
-    for _, plane, own in found:
-        if any(_cut(plane, other, diagonal) for other in planes):
-            continue
-        before = max((textures.agreement(own.on(p)) for p in planes), default=-math.inf)
-        if textures.agreement(own.on(plane)) >= RIVAL * before:
+    for _, plane, claim in found:
+        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=-math.inf)
+        if textures.agreement(claim.own.on(plane)) >= RIVAL * before:
             planes.append(plane)
     return tuple(planes)
-
-
-def _cut(plane: Plane, other: Plane, diagonal: float) -> bool:
-    """Whether planes go through each other near the object at a flat angle: they are one surface, seen roughly."""
-    heights = other.local(plane.points(*grid(diagonal / 2, 2)).reshape(-1, 3))[:, 2]
-    return not plane.crosses(other) and bool(heights.min() < 0 < heights.max())
 
 
 def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -173,9 +166,40 @@ def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Pl
     return bounds
 
 
-def _settled(
-    plane: Plane, own: _Round, bounds: Sequence[tuple[Plane, int]], half: float, levels: Sequence[Textures]
-) -> tuple[float, Plane]:
+@dataclass(frozen=True)
+class _Claim:
+    """Pixels that seem to show one plane, and a rough guess of it."""
+
+    plane: Plane
+    own: _Round
+    bounds: list[tuple[Plane, int]]  # see _bounds
+    half: float  # diagonals of the region
+
+    def agreement(self, textures: Textures, shrink: int = 1) -> Callable[[np.ndarray], float]:
+        """What is to be greatest: how alike photos look on the plane, by its pose."""
+        count = POINTS // shrink
+        x, y = (g.ravel() for g in grid(self.half, count))
+        points, there = self.plane.points(x, y), np.ones(len(x), bool)
+        for other, side in self.bounds:
+            there &= side * other.local(points)[:, 2] > 0
+        return partial(self._agreement, x[there], y[there], self.own.some(count**2 // OWN), textures)
+
+    def _agreement(self, x: np.ndarray, y: np.ndarray, own: _Round, textures: Textures, pose: np.ndarray) -> float:
+        round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
+        return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+
+    def at(self, pose: np.ndarray) -> Plane:
+        """The guess moved and tilted by [3]: offset over `half`, two slopes."""
+        return self.plane.tilted(pose[0] * self.half, pose[1], pose[2])
+
+    def pose_of(self, other: Plane) -> np.ndarray:
+        """By what the guess is moved and tilted to become another plane that does not cross it."""
+        right, down, along = self.plane.axes @ other.normal
+        offset = (other.origin - self.plane.origin) @ other.normal / along
+        return np.array([offset / self.half, -right / along, -down / along])
+
+
+def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
     """The plane where photos agree best, and how much: plane sweeps, then pattern searches with tilts (Hooke 1961).
 
     Coarse to fine: coarse pictures are matched from far off, fine ones precisely. What is best in coarse ones may be a
@@ -185,27 +209,25 @@ def _settled(
     anywhere = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
     best, at = 0.0, np.zeros(3)
     reached: list[np.ndarray] = []
-    for level, textures in enumerate(levels):
-        finest = level == len(levels) - 1
-        count = POINTS // 2 ** (len(levels) - 1 - level)
-        x, y = (g.ravel() for g in grid(half, count))
-        points, there = plane.points(x, y), np.ones(len(x), bool)
-        for other, side in bounds:
-            there &= side * other.local(points)[:, 2] > 0
-        agreement = partial(_agreement_at, plane, half, x[there], y[there], own.some(count**2 // OWN), textures)
+    for shrink, textures in zip(LEVELS, levels):
+        finest = shrink == LEVELS[-1]
+        agreement = claim.agreement(textures, shrink)
         anew = ([np.array([o, 0.0, 0.0]) for o in sweep], 1) if finest else (anywhere, TRIED)
         starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
         reached = [at]
-    return best, plane.tilted(at[0] * half, at[1], at[2])
+    return best, claim.at(at)
 
 
-def _agreement_at(
-    plane: Plane, half: float, x: np.ndarray, y: np.ndarray, own: _Round, textures: Textures, at: np.ndarray
-) -> float:
-    """Of photos on the plane moved and tilted by `at` [3]: offset over `half`, two slopes."""
-    round_it = plane.points(x, y, at[0] * half + at[1] * x + at[2] * y)
-    return textures.agreement(np.concatenate([round_it, own.on(plane.tilted(at[0] * half, at[1], at[2]))]))
+def _best_known(
+    claim: _Claim, plane: Plane, best: float, known: Sequence[Plane], textures: Textures
+) -> tuple[float, Plane]:
+    """Where photos agree better still: climbed from where other claims settled, of one surface that looked like two."""
+    agreement = claim.agreement(textures)
+    starts = [claim.pose_of(p) for p in known if p is not plane and not p.crosses(claim.plane)]
+    better = [start for start in _best_of(agreement, starts, 1) if agreement(start) > best]
+    found = [_climbed(agreement, start, FINE_STEP) for start in better]
+    return (found[0][0], claim.at(found[0][1])) if found else (best, plane)
 
 
 def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
