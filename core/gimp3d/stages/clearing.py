@@ -17,13 +17,14 @@ from ..schema import Share
 from .charts import Chart, Hits, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
-from .witness import Says, Witness, ask, total_over
+from .witness import Witness, total_over
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
 SOME_WEIGHT = 0.1  # blend weight of the removed Gaussians from which a photo may show some of the object
 RIM = 1  # px by which the object is larger in the photo than in the splats
 SPECK = 3  # px; smaller spots are splats of the floor that went along
 HAZE_WEIGHT = 0.5  # px of blend weight, over all views, below which a Gaussian draws nothing
+LEAST_SEEN = 0.5  # px of blend weight in a photo, below which it shows nothing of a Gaussian
 LOW = 0.1  # diagonals of the region above the surface up to which a rest of the object may stand
 REACH = 24  # px round the removed Gaussians in which the scene is drawn anew: their dilated surroundings
 TOUCHED = 0.05  # blend weight of the removed Gaussians from which a pixel changes
@@ -35,7 +36,7 @@ class ClearingSettings:
     """What counts as the object in photos, and as haze."""
 
     object_weight: Share = 0.25  # blend weight of the object in a pixel that shows it; rests left against more to fill
-    observed: Share = 0.5  # share of a Gaussian's weight that photos must show; haze left against true surface lost
+    observed: Share = 0.2  # share of its weight in a view that a photo must show; haze left against true surface lost
 
 
 def object_pixels(
@@ -56,22 +57,29 @@ def object_pixels(
     return parallel_map(of, views)
 
 
-def observed_share(
-    kept: Gaussians, rows: np.ndarray, views: Sequence[ViewMasks], witnesses: Sequence[Witness]
+def vouching(
+    kept: Gaussians,
+    rows: np.ndarray,  # [N] bool
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    least: float,  # share of what a Gaussian draws in a view
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each kept Gaussian in `rows` [N] bool: the share of its weight that photos show, and the weight they do not.
+    """How many photos show at least so much of each kept Gaussian, and its weight that they do not show, both [N].
 
-    Weights are blend weights in the emptied scene, summed over the pixels of all views; a photo does not show what
-    lies where the object is. What only the removal reveals has a share near 0: haze (both [N]).
+    Weights are blend weights in the emptied scene; a photo does not show what lies where the object is, and does not
+    tell what is right beside it. Haze, which only the removal reveals, is shown by none.
     """
 
     def of(pair: tuple[ViewMasks, Witness]) -> np.ndarray:
         view, witness = pair
-        labels = np.where(witness.hidden, OBJECT, ELSE).astype(np.uint8)
-        return label_weights(kept, view.camera, labels, ELSE, rows)
+        labels = np.full(witness.hidden.shape, ELSE, np.uint8)
+        labels[witness.beside] = 0
+        labels[witness.hidden] = OBJECT
+        hidden, seen = label_weights(kept, view.camera, labels, ELSE, rows)
+        return np.stack([(seen > LEAST_SEEN) & (seen >= least * (seen + hidden)), hidden])
 
-    hidden, seen = total_over(list(zip(views, witnesses)), of, (2, len(kept)))
-    return np.where(rows, seen / np.maximum(seen + hidden, 1e-9), 1.0), np.where(rows, hidden, 0.0)
+    photos, hidden = total_over(list(zip(views, witnesses)), of, (2, len(kept)))
+    return np.where(rows, photos, 0), np.where(rows, hidden, 0)
 
 
 def clear_air(
@@ -81,20 +89,16 @@ def clear_air(
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     charts: Sequence[Chart],
-    tolerance: float,
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
-    """Remove what only the removal reveals, where no photo shows that anything is; and rests of the object."""
+    """Remove what only the removal reveals and no photo shows; and rests of the object."""
     stays = ~selection.removed
     kept = scene.take(stays)
     near = near_region(scene, region, 1.0)[stays]
-    share, hidden = observed_share(kept, near, views, witnesses)
-    haze = near & kept.usable & (share < settings.observed) & (hidden > HAZE_WEIGHT)
-    candidates = np.flatnonzero(haze)
-    said = ask(witnesses, kept.means[candidates].astype(np.float64), tolerance)
-    vouched = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
+    photos, hidden = vouching(kept, near, views, witnesses, settings.observed)
     fates = selection.fates.copy()
-    fates[np.flatnonzero(stays)[candidates[~vouched]]] = Fate.REMOVED_REVEALED
+    haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
+    fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
     rows = np.flatnonzero(stays)[near & kept.usable]
     means = scene.means[rows].astype(np.float64)
     for chart in charts:

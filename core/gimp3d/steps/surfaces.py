@@ -76,8 +76,8 @@ def chart_surfaces(
     charts = draw_charts(surfaces.planes, masks.views, witnesses, region, settings.charts, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
-    tolerance, scatter = max(c.tolerance for c in charts), max(c.scatter for c in charts)
-    selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, scatter, settings.clearing)
+    tolerance = max(c.tolerance for c in charts)
+    selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, settings.clearing)
     targets = chart_targets(scene, selection, masks.views, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     cleared = int(selection.removed.sum() - masks.removed.sum())

@@ -18,7 +18,7 @@ from gimp3d.stages.clearing import (
     chart_targets,
     clear_air,
     object_pixels,
-    observed_share,
+    vouching,
 )
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.selection import Fate, Selection
@@ -86,7 +86,7 @@ def targets(plain: Removal, charts: tuple[Chart, ...]) -> Targets:
 def cleared(removal: Removal, witnesses: list[Witness] | None = None, charts: tuple[Chart, ...] = ()) -> np.ndarray:
     """Rows that clear_air removes on top of the selection's."""
     told = removal.witnesses if witnesses is None else witnesses
-    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, charts, TOLERANCE)
+    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, charts)
     new = after.removed & ~removal.selection.removed
     assert (after.fates[new] == Fate.REMOVED_REVEALED).all()
     np.testing.assert_array_equal(after.fates[~new], removal.selection.fates[~new])
@@ -133,11 +133,12 @@ def test_haze_within_the_object_goes_and_what_photos_see_stays() -> None:
 
 
 def test_the_floor_round_the_object_stays(plain: Removal) -> None:
+    """But for splats (0.03 apart) that only pixels at the object's edge show."""
     gone = plain.scene.means[cleared(plain)]
-    assert (np.abs(gone[:, :2]) < BLOCK / 2 + 0.06).all()
+    assert (np.abs(gone[:, :2]) < BLOCK / 2 + 0.08).all()
 
 
-def test_what_one_photo_sees_in_its_place_stays() -> None:
+def test_what_one_photo_sees_stays() -> None:
     """Although the object hides it in all the others."""
     given = removal(specks([[0.36, 0.1, 0.3]]))
     row = len(given.scene) - 1
@@ -151,6 +152,15 @@ def test_what_one_photo_sees_in_its_place_stays() -> None:
             assert (row in new) == (told[k] == Says.HIDDEN)
 
 
+def test_what_is_only_seen_right_beside_the_object_is_not_vouched_for() -> None:
+    """There a pixel may show the object's own edge."""
+    given = removal(specks([[0.36, 0.1, 0.3]]))
+    row = len(given.scene) - 1
+    assert row not in cleared(given)
+    everywhere = np.ones((120, 160), bool)
+    assert row in cleared(given, [replace(w, beside=everywhere) for w in given.witnesses])
+
+
 def test_far_haze_and_haze_that_draws_nothing_stay() -> None:
     faint = replace(specks([[0, 0, 0.25]]), opacity_logits=np.full(1, -12, np.float32))
     given = removal(specks([[1.4, 0, 0.2]]).extended(faint))
@@ -159,23 +169,26 @@ def test_far_haze_and_haze_that_draws_nothing_stay() -> None:
     assert not {len(given.scene) - 2, len(given.scene) - 1} & new and new
 
 
-def test_shares_are_those_of_the_blend_weights() -> None:
+def test_photos_that_show_a_share_of_the_blend_weight_are_counted() -> None:
     given = removal(specks([[0, 0, 0.25], [0.5, 0.45, 0.3]]))
     stays = ~given.selection.removed
     kept = given.scene.take(stays)
     rows = np.zeros(len(kept), bool)
     rows[-2:] = True
-    share, hidden = observed_share(kept, rows, given.views, given.witnesses)
-    assert (share[~rows] == 1).all() and (hidden[~rows] == 0).all()
-    for row in (-2, -1):
-        chosen = np.zeros(len(kept), bool)
-        chosen[row] = True
-        weights = [footprint(kept, v.camera, chosen) for v in given.views]
-        behind = sum(float(w[t.hidden].sum()) for w, t in zip(weights, given.witnesses))
-        total = sum(float(w.sum()) for w in weights)
-        assert hidden[row] == pytest.approx(behind, rel=1e-3)
-        assert share[row] == pytest.approx(1 - behind / total, abs=1e-3)
-    assert share[-2] < 0.1 < 0.9 < share[-1]
+    for least in (0.2, 0.8):
+        photos, hidden = vouching(kept, rows, given.views, given.witnesses, least)
+        assert not photos[~rows].any() and not hidden[~rows].any()
+        for row in (-2, -1):
+            chosen = np.zeros(len(kept), bool)
+            chosen[row] = True
+            count, behind = 0, 0.0
+            for view, told in zip(given.views, given.witnesses):
+                weight = footprint(kept, view.camera, chosen)
+                covered = float(weight[told.hidden].sum())
+                seen = float(weight[~told.hidden & ~told.beside].sum())
+                count, behind = count + (seen > 0.5 and seen >= least * (seen + covered)), behind + covered
+            assert photos[row] == count and hidden[row] == pytest.approx(behind, rel=1e-3)
+        assert photos[-2] == 0 < photos[-1]
 
 
 def test_targets_lie_where_the_object_was_and_meet_a_chart(plain: Removal, targets: Targets) -> None:
