@@ -64,6 +64,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:_best_known", lambda claim, plane, best, *_: (best, plane)),
     ),
     "views' agreement asks no more of photos": (("gimp3d.stages.masks:USUAL_AGREEMENT", 0.0),),
+    "no haze is cleared": (("gimp3d.stages.clearing:HAZE_WEIGHT", math.inf),),
+    "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
+    "a tenth of it is": (("clearing.observed", 0.1),),
+    "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),
     "the paper's sampling": (("propagate.transfer", "sample"),),

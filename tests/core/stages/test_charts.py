@@ -65,6 +65,7 @@ def room(
     planes: list[tuple[np.ndarray, float]],
     noise: float = 0.0,
     colours: Callable[[np.ndarray], np.ndarray] = texture,
+    block: bool = True,
 ) -> Room:
     """Photos and depth maps, the latter with relative noise."""
     rng = np.random.default_rng(5)
@@ -73,7 +74,7 @@ def room(
         shape = (camera.height, camera.width)
         rays = camera.unproject(camera.pixel_centres(), np.ones(shape)) - camera.centre
         surface = np.min([plane_reach(camera.centre, rays, p) for p in planes], axis=0)
-        front = block_reach(camera.centre, rays)
+        front = block_reach(camera.centre, rays) if block else np.full(shape, np.inf)
         z = np.minimum(surface, front)
         shown = np.isfinite(z)
         z = np.where(shown, z, 0)
@@ -461,3 +462,24 @@ def test_a_chart_is_not_met_from_below_nor_behind_the_camera() -> None:
     for eye, target in (([0.1, 0, -2], [0, 0, 0]), ([0.1, 0, 2], [0, 0, 4])):
         camera = replace(EYES[0], viewmat=look_at(np.array(eye, float), np.array(target, float), np.array([0.0, 1, 0])))
         assert (first_hits([chart], camera, everything).chart == -1).all()
+
+
+@pytest.mark.parametrize("photos", [1, 4])
+def test_what_a_single_photo_shows_through_the_object_is_no_island_in_the_hole(photos: int) -> None:
+    """A gap in its mask shows who knows what; several photos bear each other out."""
+    given = room(EYES, [FLOOR])
+    gap = np.array([[0.0, 0.0, 0.0]])
+    witnesses = []
+    for k, witness in enumerate(given.witnesses):
+        col, row = witness.camera.project(gap)[0][0].astype(int)
+        at = np.zeros(witness.hidden.shape, bool)
+        if k < photos:
+            at[row - 3 : row + 4, col - 3 : col + 4] = True
+        there = room((witness.camera,), [FLOOR], block=False).witnesses[0]
+        depth, photo = np.where(at, there.depth, witness.depth), np.where(at[..., None], there.photo, witness.photo)
+        witnesses.append(replace(witness, hidden=witness.hidden & ~at, depth=depth, photo=photo))
+    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], given.views, witnesses, REGION)
+    uv, _ = chart.camera.project(gap)
+    col, row = uv[0].astype(int)
+    island = ~chart.hole[row - 2 : row + 3, col - 2 : col + 3]
+    assert island.all() if photos > 1 else not island.any()

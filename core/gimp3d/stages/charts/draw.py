@@ -121,7 +121,8 @@ def _chart(
         in_region(region, surface.texels).reshape(surface.depth.shape),
         _marked(surface.texels, witnesses, marked, surface.depth.shape),
     )
-    hole = (shown.hole & ~below) | rests
+    hole = _without_islands((shown.hole & ~below) | rests, (shown.photos < 2) & shown.there)
+    below &= ~hole
     return Chart(
         plane,
         camera,
@@ -203,6 +204,17 @@ def _told_by_colours(
     below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
     below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
     return below, object_ & (s.photos > 0)
+
+
+def _without_islands(
+    hole: np.ndarray,  # [H, W] bool
+    doubtful: np.ndarray,  # [H, W] bool
+) -> np.ndarray:
+    """The hole with what is doubtful in it: one photo's word through a gap, or what is below masks, joins the outside.
+
+    The object's foot may have the surface's colours, and what stands before it shows through its mask.
+    """
+    return hole | (scipy.ndimage.binary_fill_holes(hole) & doubtful)
 
 
 def usual_spread(spread: np.ndarray) -> float:
