@@ -10,8 +10,8 @@ import numpy as np
 
 from ..box import Region
 from ..compute.threads import parallel_map
-from ..gaussians import Gaussians
-from ..geometry import dilated, sees, window_mask
+from ..gaussians import SH_C0, Gaussians
+from ..geometry import dilated, framed, sees, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
 from .charts import Chart, Hits, extent, first_hits
@@ -25,6 +25,7 @@ RIM = 1  # px by which the object is larger in the photo than in the splats
 SPECK = 3  # px; smaller spots are splats of the floor that went along
 HAZE_WEIGHT = 0.5  # px of blend weight, over all views, below which a Gaussian draws nothing
 LEAST_SEEN = 0.5  # px of blend weight in a photo, below which it shows nothing of a Gaussian
+LIKE = 30.0  # grey levels within which a Gaussian's colour is that of the surface it lies on
 LOW = 0.1  # diagonals of the region above the surface up to which a rest of the object may stand
 REACH = 24  # px round the removed Gaussians in which the scene is drawn anew: their dilated surroundings
 TOUCHED = 0.05  # blend weight of the removed Gaussians from which a pixel changes
@@ -82,6 +83,23 @@ def vouching(
     return np.where(rows, photos, 0), np.where(rows, hidden, 0)
 
 
+def _surface_rows(scene: Gaussians, selection: Selection, charts: Sequence[Chart]) -> np.ndarray:
+    """Rows taken for the object, though they lie on a chart and look like it, where photos show it.
+
+    Selection follows planes; only charts know uneven surface. They lie on it within what views' surfaces do.
+    """
+    rows = np.flatnonzero(np.isin(selection.fates, (Fate.REMOVED_INSIDE, Fate.REMOVED_STRADDLING)))
+    colours = 255 * np.clip(0.5 + SH_C0 * scene.sh[rows, 0], 0, 1)
+    back = np.zeros(len(rows), bool)
+    for chart in charts:
+        index, *at, z = framed(chart.camera, scene.means[rows].astype(np.float64))
+        texels = tuple(at)
+        shown = (chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below)[texels]
+        unlike = np.abs(colours[index] - chart.image[texels]).max(-1)
+        back[index] |= shown & (np.abs(z - chart.depth[texels]) < chart.noise) & (unlike < LIKE)
+    return rows[back]
+
+
 def clear_air(
     scene: Gaussians,
     region: Region,
@@ -91,7 +109,7 @@ def clear_air(
     charts: Sequence[Chart],
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
-    """Remove what only the removal reveals and no photo shows; and rests of the object."""
+    """Remove what only the removal reveals and no photo shows, and rests of the object; give back what is surface."""
     stays = ~selection.removed
     kept = scene.take(stays)
     near = near_region(scene, region, 1.0)[stays]
@@ -99,6 +117,7 @@ def clear_air(
     fates = selection.fates.copy()
     haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
     fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
+    fates[_surface_rows(scene, selection, charts)] = Fate.KEPT_SURFACE
     rows = np.flatnonzero(stays)[near & kept.usable]
     means = scene.means[rows].astype(np.float64)
     for chart in charts:

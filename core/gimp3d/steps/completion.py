@@ -137,11 +137,9 @@ def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSet
         chart.image,
         hole,
         settings.random_seed,
-        None if chart.kind == "plane" else disparity_of(chart.depth),
-        chart.camera.K,
-        ~chart.known & ~hole,
-        call,
-        settings.variant,
+        unknown=~chart.known & ~hole,
+        call=call,
+        variant=settings.variant,
     )
 
 

@@ -80,5 +80,5 @@ def chart_surfaces(
     selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, settings.clearing)
     targets = chart_targets(scene, selection, masks.views, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
-    cleared = int(selection.removed.sum() - masks.removed.sum())
+    cleared = int((selection.removed & ~masks.removed).sum())
     return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))

@@ -123,6 +123,24 @@ def test_rests_on_texels_that_show_the_object_go(charts: tuple[Chart, ...]) -> N
     assert np.abs([x - beside[0], y - beside[1]]).max() < 0.1
 
 
+def test_what_lies_on_a_chart_and_looks_like_it_is_given_back(plain: Removal, charts: tuple[Chart, ...]) -> None:
+    """A splat of uneven floor that selection took; not what is higher, unlike it, in the hole or masked."""
+    (chart,) = charts
+    chart = replace(chart, noise=0.05)
+    grey = float(chart.image[chart.known].mean()) / 255
+    places = np.array([[0.45, 0.0, 0.02], [0.45, 0.1, 0.3], [0.45, -0.1, 0.0], [0.0, 0.0, 0.0], [0.45, 0.2, 0.0]])
+    shades = np.full((len(places), 3), grey)
+    shades[2] = [0.9, 0.1, 0.1]
+    whole = plain.scene.extended(discs(places, (0, 0, 1), shades, 0.03))
+    taken = np.full(len(places), Fate.REMOVED_INSIDE, np.uint8)
+    taken[-1] = Fate.REMOVED_MASKED
+    given = replace(plain, scene=whole, selection=Selection(np.concatenate([plain.selection.fates, taken])))
+    after = clear_air(whole, REGION, given.selection, given.views, given.witnesses, (chart,))
+    back = given.selection.removed & ~after.removed
+    assert set(np.flatnonzero(back) - len(plain.scene)) == {0}
+    assert (after.fates[back] == Fate.KEPT_SURFACE).all()
+
+
 def test_haze_within_the_object_goes_and_what_photos_see_stays() -> None:
     given = removal(specks([[0, 0, 0.25], [0.1, -0.1, 0.3], [0.5, 0.45, 0.3], [0, 0, 0.75]]))
     new = cleared(given)
