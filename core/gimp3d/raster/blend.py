@@ -22,6 +22,7 @@ from ..compute.simd import (
     lowest_bit,
     max16,
     min16,
+    next_bit,
     prefetch,
     rows16,
     splat16,
@@ -152,42 +153,31 @@ def _open(state, mask, stop):
 
 
 @exact_kernel
-def blend_range(
-    lo,
-    hi,
-    order,  # [S] slots in the order in which they are done
-    tiles,  # [S]
-    across,
-    width,  # of the pictures
-    starts,  # [S] first entry of each slot
-    stops,  # [S] one past the last
-    entries,  # [P]
-    features,  # [N, 16 or 32]
-    surfels,  # features are of surfels
-    limits,  # [6] float32: alpha_min, alpha_max, stop, near, low-pass factor of surfels, distortion's near
-    shifts,  # [S] float32 > 0: depths (and their disparities) are summed less this one, against cancellation
-    flags,  # [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
-    # 1 + its Gaussian's row as int32 bits
-    wanted,  # [S] uint64: blocks to draw
-    front,  # [S, TILE_STATE] what lies before the entries, or empty
-    masks,  # [P] uint64 out: blocks that each entry was blended into, or empty
-    closings,  # [P/CHECK + S + 1] uint64 out: blocks with closing pixels at each check, or empty
-    ends,  # [S] int64 out: one past the last entry that was looked at
-    states,  # [S, TILE_STATE] out; [0, …] if the caller needs only the pictures
-    background,  # [3]
-    back,  # [S, TILE_STATE] what lies behind the entries, or empty
-    pictures,  # (rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H]) out: flat, W = width
-    # and H rounded up to whole blocks; empty where not asked for, and if alpha is empty, only the states are made
-):
-    """Blend the tiles of slots order[lo:hi]."""
-    alpha_min, alpha_max, stop = limits[0], limits[1], limits[2]
-    near, disc, distortion_near = limits[3], limits[4], limits[5]
-    with_rgb, with_depth, with_median, with_normals, with_distortion = flags[0], flags[1], flags[2], flags[3], flags[4]
+def blend_range(slots, lists, given, kept, flags, front, pictures):
+    """Blend the tiles of some slots into pictures, or, if the alpha of these is empty, only make the states.
+
+    lists: tiles [S], how many across, the pictures' width, starts [S], stops [S], entries [P].
+    given: features [N, 16 or 32]; whether of surfels; limits (alpha_min, alpha_max, stop, near, surfels' low-pass
+      factor, distortion_near); blocks to draw, wanted [S] uint64; shifts [S] float32 > 0: depths (and disparities) are
+      summed less this one, against cancellation; background [3]; what lies behind, back [S, TILE_STATE], or empty.
+    kept, out, where not empty: the blocks that each entry was blended into, masks [P] uint64; those with closing pixels
+      at each check, closings [P/CHECK + S + 1] uint64; one past the last entry that was looked at, ends [S] int64
+      (never empty); states [S, TILE_STATE].
+    flags [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
+      1 + its Gaussian's row as int32 bits.
+    front [S, TILE_STATE]: what lies before the entries, or empty.
+    pictures, out: rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H], flat, W = width and H
+      rounded up to whole blocks; empty where not asked for.
+    """
+    tiles, across, width, starts, stops, entries = lists
+    features, surfels, limits, wanted, shifts, background, back = given
+    masks, closings, ends, states = kept
+    alpha_min, alpha_max, stop, near, disc, distortion_near = limits
+    with_rgb, with_depth, with_median, with_normals, with_distortion, _ = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     own_state, covers = aligned_empty(TILE_STATE), np.empty(CHECK, np.uint64)
-    for j in range(lo, hi):
-        slot = order[j]
+    for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state = states[slot] if len(states) else own_state
         if len(front):
@@ -217,8 +207,7 @@ def blend_range(
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 disparity = distortion_near / depth
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
                     u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
@@ -248,8 +237,7 @@ def blend_range(
                 along0, down0 = fma16(column, xx, row * xy), row * yy
                 m = splat16(distortion_near / depth - disparity_shift)
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
                     _, alpha = ellipse_alpha(
@@ -328,8 +316,7 @@ def _finish(
     numbers = depths.view(np.int32)
     mask = wanted
     while mask:
-        b = lowest_bit(mask)
-        mask &= mask - uint64(1)
+        b, mask = next_bit(mask)
         k = b * BLOCK_STATE
         u, v = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
         o = v * width + u
@@ -381,25 +368,14 @@ def depth_at(flat, o, u, v, surfels, limits):
 
 
 @exact_kernel
-def weigh_range(
-    lo,
-    hi,
-    order,
-    tiles,
-    across,
-    _width,
-    starts,
-    stops,
-    entries,
-    features,
-    surfels,
-    limits,
-    labels,  # [H, W] uint8: 0 where weights do not count, else 1 … K
-    sums,  # [K, P] out: Σ of the blend weights of each list entry over the pixels of a label; zero on entry
-    peaks,  # [P] out: their maximum over all labels
-):
-    """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count."""
-    alpha_min, alpha_max, stop, near, disc = limits[0], limits[1], limits[2], limits[3], limits[4]
+def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
+    """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count.
+
+    `labels` [H, W] uint8: 0 where weights do not count, else 1 … K. Out: `sums` [K, P], zero on entry, of the weights
+    of each list entry over the pixels of a label, and `peaks` [P], their maximum. The others as for blend_range.
+    """
+    tiles, across, _, starts, stops, entries = lists
+    alpha_min, alpha_max, stop, near, disc, _ = limits
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     height, width = labels.shape
@@ -407,8 +383,7 @@ def weigh_range(
     size = COUNTED + 16 * kinds
     state, covers = aligned_empty(BLOCKS * size), np.empty(CHECK, np.uint64)
     weight_sums = aligned_empty(16 * kinds)
-    for j in range(lo, hi):
-        slot = order[j]
+    for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         for b in range(BLOCKS):
             k = b * size
@@ -432,13 +407,10 @@ def weigh_range(
             for label in range(kinds):
                 store16(weight_sums, 16 * label, none)
             while mask:
-                b = lowest_bit(mask)
-                mask &= mask - uint64(1)
+                b, mask = next_bit(mask)
                 k = b * size
-                x, y = (
-                    float32(left) + HALF + BLOCK_PX * float32(b & 7),
-                    float32(top) + HALF + BLOCK_PX * float32(b >> 3),
-                )
+                x = float32(left) + HALF + BLOCK_PX * float32(b & 7)
+                y = float32(top) + HALF + BLOCK_PX * float32(b >> 3)
                 if surfels:
                     centre_x, centre_y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
                     dx, dy = column + (x - centre_x), row + (y - centre_y)

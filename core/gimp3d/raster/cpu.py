@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,19 +11,11 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import announce_compilation
 from ..compute.threads import parallel_map, run_ranges, thread_count
-from ..gaussians import Gaussians
+from ..gaussians import ARRAYS, Gaussians
+from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
-from .project import (
-    DEPTH,
-    DRAWN,
-    ELLIPSE_ROW,
-    HALF_LOG2E,
-    SURFEL_ROW,
-    TILE,
-    UNUSABLE,
-    project_range,
-)
+from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, UNUSABLE, project_range
 from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
@@ -31,8 +23,8 @@ from .unproject import unproject_range
 FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
+NO_PICTURES = (np.empty(0, np.float32),) * 6
 CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
-NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
 
 
 @dataclass(frozen=True)
@@ -53,35 +45,25 @@ def project(
     camera: Camera,
     settings: RasterSettings,
     with_colour: bool,
-    out: Projected | None = None,
     slots: np.ndarray | None = None,
+    features: np.ndarray | None = None,
 ) -> Projected:
-    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `out` where it is given."""
+    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `features` if given."""
     announce_compilation()
-    n = len(gaussians)
-    if out is None:
-        features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
-        out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
-    *geometry, sh = values_of(gaussians)
-    run_ranges(
-        project_range,
-        n,
-        *geometry,
-        sh,
-        sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
-        pack_camera(camera),
-        *tile_grid(camera),
-        np.array((0, 0, *tile_grid(camera)) if slots is None else _rectangle(slots >= 0), np.int64),
-        float(settings.near),
-        float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
-        float(settings.alpha_min),
-        bool(gaussians.antialiased),
-        with_colour,
-        out.features,
-        out.rects,
-        out.states,
-    )
+    n, low_pass = len(gaussians), settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass
+    if features is None:
+        features = np.empty((n, row_size(gaussians)), np.float32)
+    out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+    grid = tile_grid(camera)
+    tiles = np.array([*((0, 0, *grid) if slots is None else _rectangle(slots >= 0)), *grid], np.int64)
+    limits = float(settings.near), float(low_pass), float(settings.alpha_min), bool(gaussians.antialiased)
+    given = values_of(gaussians), pack_camera(camera), tiles, limits, with_colour
+    run_ranges(project_range, n, *given, out.features, out.rects, out.states)
     return out
+
+
+def row_size(gaussians: Gaussians) -> int:
+    return SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW
 
 
 def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
@@ -97,8 +79,7 @@ def raw(values: np.ndarray) -> np.ndarray:
 
 def values_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     """What is stored of Gaussians, in the order in which all kernels take it and give gradients."""
-    g = gaussians
-    return tuple(raw(values) for values in (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh))
+    return tuple(raw(getattr(gaussians, name)) for name in ARRAYS)
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -107,7 +88,7 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 
 
 def pack_camera(camera: Camera) -> np.ndarray:
-    """What project_range reads of a camera, [23] float64; the Jacobian's bounds are gsplat's."""
+    """What project_range reads of a camera, [22] float64; the Jacobian's bounds are gsplat's."""
     margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * camera.width, 0.5 * FRUSTUM_MARGIN * camera.height
     bounds = [
         (-camera.cx - margin_x) / camera.fx,
@@ -115,12 +96,11 @@ def pack_camera(camera: Camera) -> np.ndarray:
         (-camera.cy - margin_y) / camera.fy,
         (camera.height - camera.cy + margin_y) / camera.fy,
     ]
-    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return np.concatenate([camera.R.ravel(), camera.t, intrinsics, camera.centre, bounds]).astype(np.float64)
+    return np.append(pack_pinhole(camera), bounds)
 
 
-def pass_flags(passes: frozenset[str]) -> np.ndarray:
-    """blend_range's flags, [6] bool: rgb, expected depth, median depth, normals, distortion, numbers for depths.
+def pass_flags(passes: frozenset[str]) -> tuple[bool, ...]:
+    """blend_range's flags.
 
     Raises
     ------
@@ -130,15 +110,14 @@ def pass_flags(passes: frozenset[str]) -> np.ndarray:
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
-    wanted = ["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes]
-    return np.array([*wanted, False])
+    return ("rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes, False)
 
 
-def pack_limits(settings: RasterSettings) -> np.ndarray:
-    """blend_range's limits, [6] float32."""
+def pack_limits(settings: RasterSettings) -> tuple[np.float32, ...]:
+    """blend_range's limits."""
     disc = HALF_LOG2E / settings.surfel_low_pass
-    limits = [settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near]
-    return np.array(limits, np.float32)
+    limits = (settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near)
+    return tuple(np.float32(value) for value in limits)
 
 
 def padded_size(camera: Camera) -> tuple[int, int]:
@@ -146,7 +125,7 @@ def padded_size(camera: Camera) -> tuple[int, int]:
     return -(-int(camera.height) // BLOCK) * BLOCK, -(-int(camera.width) // BLOCK) * BLOCK
 
 
-def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
+def empty_pictures(camera: Camera, flags: tuple[bool, ...]) -> tuple[np.ndarray, ...]:
     """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
     wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
     height, width = padded_size(camera)
@@ -164,11 +143,10 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
 
 def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
     """The kernels' pictures without what pads them to whole blocks."""
-    height, width = padded_size(camera)
     cut = []
     for flat, channels in zip(pictures, CHANNELS):
-        picture = flat.reshape(height if len(flat) else 0, width if len(flat) else 0, channels)
-        picture = picture[: camera.height, : camera.width]
+        height, width = padded_size(camera) if len(flat) else (0, 0)
+        picture = flat.reshape(height, width, channels)[: camera.height, : camera.width]
         cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
     rgb, alpha, expected, median, normals, distortion = cut
     return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
@@ -202,34 +180,50 @@ def wanted_blocks(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return blocks.reshape(down, across)
 
 
-def slots_of(
-    wanted: np.ndarray,  # [down, across] bool
-) -> np.ndarray:
-    """Slots [down, across] int32 of the wanted tiles in row-major order, −1 elsewhere."""
+def slots_of(wanted: np.ndarray) -> np.ndarray:
+    """Slots [down, across] int32 of the wanted tiles [down, across] bool in row-major order, −1 elsewhere."""
     return np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1).astype(np.int32)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What the way back needs of a rendering."""
+    """Lists to blend into a view, and, once they are, what the way back needs."""
 
     gaussians: Gaussians  # those that get gradients
     view: Projected  # of them
     camera: Camera
     settings: RasterSettings
-    flags: np.ndarray
-    features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
+    flags: tuple[bool, ...]
     lists: TileLists
+    features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
     wanted: np.ndarray  # [S] uint64
-    shifts: np.ndarray  # [S] float32
-    masks: np.ndarray  # [P] uint64
-    closings: np.ndarray  # uint64
-    ends: np.ndarray  # [S] int64
-    states: np.ndarray  # [S, TILE_STATE] float32
-    back: np.ndarray  # [S, TILE_STATE] or empty
+    shifts: np.ndarray  # [S] float32, see depth_shifts
+    back: np.ndarray = field(default_factory=lambda: NO_STATES)  # [S, TILE_STATE] or empty
+    kept: tuple[np.ndarray, ...] = ()  # what blend_range keeps
+
+    def given(self) -> tuple[Any, ...]:
+        """As kernels over tiles take it."""
+        limits, background = pack_limits(self.settings), np.asarray(self.settings.background, np.float32)
+        surfels = self.gaussians.is_surfels
+        return self.features, surfels, limits, self.wanted, self.shifts, background, self.back
 
     def backward(self, gradients: PictureGradients) -> Gradients:
-        return _backward(self, gradients)
+        check_gradients(gradients, self.camera)
+        given = tuple(padded(getattr(gradients, f.name), self.camera) for f in fields(gradients))
+        flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4, 5))
+        names = ("rgb", "expected_depth", "median_depth", "normals", "distortion")
+        missing = [name for name, wanted, drawn in zip(names, flags, self.flags) if wanted and not drawn]
+        if missing:
+            raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
+        records = np.empty(len(self.lists.records) * RECORD, np.float32)
+        active = len(self.features) - len(self.gaussians), self.lists.records, records
+        over_tiles(unblend_range, self.lists, self.camera, self.given(), self.kept, flags, given, *active)
+        values = values_of(self.gaussians)
+        found = tuple(np.zeros(v.shape, np.float32) for v in values)
+        how = pack_camera(self.camera), float(self.settings.low_pass), bool(self.gaussians.antialiased)
+        drawn = self.view.features, self.view.states, self.lists.spans, records
+        run_ranges(unproject_range, len(self.gaussians), values, *how, *drawn, found)
+        return Gradients(*found)
 
 
 def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
@@ -246,123 +240,24 @@ def trace(
 ) -> tuple[Rendering, Trace]:
     flags = pass_flags(passes)
     slots, wanted = whole_picture(camera)
-    view = project(gaussians, camera, settings, bool(flags[0]), slots=slots)
+    view = project(gaussians, camera, settings, flags[0], slots)
     lists = tile_lists(view.features, view.rects, view.states, slots, with_records=True)
     shifts = depth_shifts(lists, view.features)
-    pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep=True)
-    return as_rendering(pictures, camera, view.ignored), kept
+    return blend(Trace(gaussians, view, camera, settings, flags, lists, view.features, wanted, shifts), keep=True)
 
 
-def blend(
-    gaussians: Gaussians,
-    view: Projected,
-    camera: Camera,
-    settings: RasterSettings,
-    flags: np.ndarray,
-    features: np.ndarray,
-    lists: TileLists,
-    wanted: np.ndarray,
-    shifts: np.ndarray,
-    keep: bool,
-    front: np.ndarray = NO_STATES,
-    back: np.ndarray = NO_STATES,
-) -> tuple[tuple[np.ndarray, ...], Trace]:
-    """Blend the lists into pictures."""
-    slot_count, entry_count = len(lists.tiles), len(lists.entries)
-    kept = Trace(
-        gaussians,
-        view,
-        camera,
-        settings,
-        flags,
-        features,
-        lists,
-        wanted,
-        shifts,
-        np.empty(entry_count, np.uint64) if keep else NO_MASKS,
-        np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
-        np.empty(slot_count, np.int64),
-        np.empty((slot_count, TILE_STATE), np.float32) if keep else NO_STATES,
-        back,
+def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Rendering, Trace]:
+    """Blend the lists, behind what is in front, into pictures."""
+    slots, entries = len(traced.lists.tiles), len(traced.lists.entries)
+    kept = (
+        np.empty(entries if keep else 0, np.uint64),
+        np.empty(entries // CHECK + slots + 1 if keep else 0, np.uint64),
+        np.empty(slots, np.int64),
+        np.empty((slots if keep else 0, TILE_STATE), np.float32),
     )
-    pictures = empty_pictures(camera, flags)
-    over_tiles(
-        blend_range,
-        lists,
-        camera,
-        features,
-        gaussians.is_surfels,
-        pack_limits(settings),
-        shifts,
-        flags,
-        wanted,
-        front,
-        kept.masks,
-        kept.closings,
-        kept.ends,
-        kept.states,
-        np.asarray(settings.background, np.float32),
-        back,
-        pictures,
-    )
-    return pictures, kept
-
-
-def _backward(traced: Trace, given: PictureGradients) -> Gradients:
-    lists, settings = traced.lists, traced.settings
-    check_gradients(given, traced.camera)
-    gradients = [padded(getattr(given, f.name), traced.camera) for f in fields(given)]
-    flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
-    missing = [
-        name
-        for name, g, f in zip(("rgb", "expected_depth", "median_depth", "normals", "distortion"), flags, traced.flags)
-        if g and not f
-    ]
-    if missing:
-        raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
-    records = np.empty((len(lists.records), RECORD), np.float32)
-    over_tiles(
-        unblend_range,
-        lists,
-        traced.camera,
-        traced.features,
-        traced.gaussians.is_surfels,
-        pack_limits(settings),
-        traced.shifts,
-        flags,
-        traced.wanted,
-        traced.masks,
-        traced.closings,
-        traced.ends,
-        traced.states,
-        np.asarray(settings.background, np.float32),
-        traced.back,
-        tuple(gradients),
-        len(traced.features) - len(traced.gaussians),
-        lists.records,
-        records.reshape(-1),
-    )
-    return _unproject(traced, records.reshape(-1))
-
-
-def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
-    """Gradients of the traced Gaussians."""
-    values = values_of(traced.gaussians)
-    found = tuple(np.empty(v.shape, np.float32) for v in values)
-    run_ranges(
-        unproject_range,
-        len(traced.gaussians),
-        *values,
-        pack_camera(traced.camera),
-        float(traced.settings.low_pass),
-        bool(traced.gaussians.antialiased),
-        traced.view.features,
-        traced.view.states,
-        traced.lists.spans,
-        records,
-        *found,
-    )
-    return Gradients(*found)
+    pictures = empty_pictures(traced.camera, traced.flags)
+    over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, traced.flags, front, pictures)
+    return as_rendering(pictures, traced.camera, traced.view.ignored), replace(traced, kept=kept)
 
 
 def check_gradients(given: PictureGradients, camera: Camera) -> None:
@@ -379,12 +274,9 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     order = np.argsort(lists.starts - lists.stops, kind="stable")
     threads = thread_count()
     chunks = 1 if threads == 1 else min(6 * threads, max(threads, len(order) // 4))
-    across, _ = tile_grid(camera)
-    shared = (lists.tiles, across, padded_size(camera)[1], lists.starts, lists.stops, lists.entries)
-    parallel_map(
-        lambda part: kernel_range(0, len(part), part, *shared, *args),
-        [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)],
-    )
+    packed = lists.tiles, tile_grid(camera)[0], padded_size(camera)[1], lists.starts, lists.stops, lists.entries
+    parts = [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)]
+    parallel_map(lambda part: kernel_range(part, packed, *args), parts)
 
 
 def contributions(
@@ -410,9 +302,9 @@ def _weigh(
     gaussians: Gaussians,
     camera: Camera,
     settings: RasterSettings,
-    labels: np.ndarray,  # [H, W] 0 … count
+    labels: np.ndarray,
     count: int,
-    rows: np.ndarray | None,  # [N] bool: whose weights are asked for
+    rows: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
     shape = (camera.height, camera.width)

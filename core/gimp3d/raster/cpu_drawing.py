@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from .project import BLUE, RED
 from .surface import meet_range
 from .types import RasterSettings, Rendering
 
-NUMBERS_ONLY = np.array([False, False, True, False, False, True])  # blend_range's flags
+NUMBERS_ONLY = (False, False, True, False, False, True)  # blend_range's flags
 
 
 class CpuDrawing:
@@ -32,8 +33,7 @@ class CpuDrawing:
     ) -> None:
         self.gaussians, self.camera, self.settings, self.with_colour = gaussians, camera, settings, with_colour
         self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
-        self._view = cpu.project(gaussians, camera, settings, with_colour, slots=self._slots)
-        view = self._view
+        self._view = view = cpu.project(gaussians, camera, settings, with_colour, self._slots)
         self._lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
 
     def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
@@ -41,26 +41,20 @@ class CpuDrawing:
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
         if pixels is None:
-            return self._draw(flags, self.settings, self._lists, self._wanted)
+            return self._draw(flags, self._wanted)
         blocks = cpu.wanted_blocks(self.camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
-        return self._draw(flags, self.settings, self._lists, self._wanted & blocks[self._slots >= 0])
+        return self._draw(flags, self._wanted & blocks[self._slots >= 0])
 
     def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         lists = self._lists if gone is None else _without(self._lists, gone)
         if self.gaussians.is_surfels:
-            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self.settings, lists, self._wanted)
+            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self._wanted, lists)
             return drawn.median_depth, drawn.alpha
-        drawn = self._draw(NUMBERS_ONLY, self.settings, lists, self._wanted)
-        depth = np.zeros(drawn.alpha.shape, np.float32)
-        run_ranges(
-            meet_range,
-            len(depth),
-            drawn.median_depth.view(np.int32),
-            *cpu.values_of(self.gaussians)[:3],
-            cpu.pack_camera(self.camera),
-            float(self.settings.low_pass),
-            depth,
-        )
+        drawn = self._draw(NUMBERS_ONLY, self._wanted, lists)
+        depth, numbers = np.zeros(drawn.alpha.shape, np.float32), drawn.median_depth.view(np.int32)
+        means, log_scales, quats, _, _ = cpu.values_of(self.gaussians)
+        camera, low_pass = cpu.pack_camera(self.camera), float(self.settings.low_pass)
+        run_ranges(meet_range, len(depth), numbers, means, log_scales, quats, camera, low_pass, depth)
         return depth, drawn.alpha
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
@@ -69,17 +63,17 @@ class CpuDrawing:
         if self.with_colour:
             raise ValueError("footprint: this drawing has colours; make one without")
         _paint(self._lists.entries, chosen, self._view.features)
-        black = replace(self.settings, background=(0.0, 0.0, 0.0))
-        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), black, self._lists, self._wanted)
+        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), self._wanted, background=(0.0, 0.0, 0.0))
         return np.ascontiguousarray(drawn.rgb[..., 0])
 
-    def _draw(self, flags: np.ndarray, settings: RasterSettings, lists: TileLists, wanted: np.ndarray) -> Rendering:
-        view, features = self._view, self._view.features
-        shifts = cpu.depth_shifts(lists, features)
-        pictures, _ = cpu.blend(
-            self.gaussians, view, self.camera, settings, flags, features, lists, wanted, shifts, keep=False
-        )
-        return cpu.as_rendering(pictures, self.camera, view.ignored)
+    def _draw(
+        self, flags: tuple[bool, ...], wanted: np.ndarray, lists: TileLists | None = None, **changed: Any
+    ) -> Rendering:
+        """Draw the wanted blocks, of the drawing's lists and with its settings where no others are given."""
+        view, lists, settings = self._view, lists or self._lists, replace(self.settings, **changed)
+        shifts = cpu.depth_shifts(lists, view.features)
+        traced = cpu.Trace(self.gaussians, view, self.camera, settings, flags, lists, view.features, wanted, shifts)
+        return cpu.blend(traced, keep=False)[0]
 
 
 def _without(lists: TileLists, gone: np.ndarray) -> TileLists:
