@@ -65,11 +65,8 @@ class Box:
         """[3, 3], columns are the box's axes in the scene."""
         return quats_to_matrices(self.rotation_wxyz[None])[0]
 
-    def contains(
-        self,
-        points: np.ndarray,  # [N, 3]
-    ) -> np.ndarray:
-        """[N] bool; points on a face are inside, NaN is outside."""
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """[N] bool of points [N, 3]; those on a face are inside, NaN is outside."""
         local = (points - self.center) @ self.axes
         return (np.abs(local) <= self.size / 2).all(-1)
 
@@ -85,23 +82,14 @@ class Box:
 Region = tuple[Box, ...]
 
 
-def in_region(
-    region: Sequence[Box],
-    points: np.ndarray,  # [N, 3]
-) -> np.ndarray:
-    """[N] bool: inside any of the boxes."""
-    inside = np.zeros(len(points), dtype=bool)
-    for box in region:
-        inside |= box.contains(points)
-    return inside
+def in_region(region: Sequence[Box], points: np.ndarray) -> np.ndarray:
+    """[N] bool: points [N, 3] inside any of the boxes."""
+    return np.any([np.zeros(len(points), bool), *(box.contains(points) for box in region)], axis=0)
 
 
-def box_from_matrix(
-    matrix: np.ndarray,  # [4, 4] unit-cube-to-scene transform without shear
-    bounds_min: np.ndarray,  # [3] of the shape in its own axes
-    bounds_max: np.ndarray,  # [3]
-) -> Box:
-    """The box that a transform makes of axis-aligned bounds; any rotation, scale (also negative), translation.
+def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.ndarray) -> Box:
+    """The box that a transform [4, 4] makes of bounds [3] along a shape's own axes: any rotation, scale (also
+    negative), translation.
 
     Raises
     ------

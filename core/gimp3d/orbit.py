@@ -121,12 +121,8 @@ def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     return np.round(normal * (1.0 if normal @ normals[best] > 0 else -1.0), 6)
 
 
-def look_at(
-    eye: np.ndarray,  # [3]
-    target: np.ndarray,  # [3]
-    up: np.ndarray,  # [3], not along the view
-) -> np.ndarray:
-    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`."""
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` [3] that looks at `target`, `up` not along it."""
     forward = _unit(target - eye)
     right = _unit(np.cross(forward, up))
     rotation = np.stack([right, np.cross(forward, right), forward])

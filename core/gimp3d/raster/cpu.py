@@ -16,7 +16,7 @@ from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
 from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, UNUSABLE, project_range
-from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
+from .types import PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
@@ -162,7 +162,7 @@ def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
 
 
-def wanted_tiles(camera: Camera, pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def wanted_tiles(camera: Camera, pixels: Mask) -> tuple[np.ndarray, np.ndarray]:
     """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
     if pixels is None:
         return whole_picture(camera)
@@ -279,32 +279,18 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     parallel_map(lambda part: kernel_range(part, packed, *args), parts)
 
 
-def contributions(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
-) -> Contributions:
+def contributions(gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: Mask) -> Contributions:
     labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
     total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
     return Contributions(total[0], peak)
 
 
-def label_weights(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    labels: np.ndarray,
-    count: int,
-    rows: np.ndarray | None,
-) -> np.ndarray:
-    return _weigh(gaussians, camera, settings, labels, count, rows)[0]
+def label_weights(gaussians: Gaussians, camera: Camera, labels: np.ndarray, count: int, rows: Mask) -> np.ndarray:
+    return _weigh(gaussians, camera, RasterSettings(), labels, count, rows)[0]
 
 
 def _weigh(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    labels: np.ndarray,
-    count: int,
-    rows: np.ndarray | None,
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, labels: np.ndarray, count: int, rows: Mask
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
     shape = (camera.height, camera.width)
@@ -326,8 +312,8 @@ def _weigh(
     return total, peak
 
 
-def touched_window(gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window:
-    view = project(gaussians, camera, settings, with_colour=False)
+def touched_window(gaussians: Gaussians, camera: Camera, margin: int) -> Window:
+    view = project(gaussians, camera, RasterSettings(), with_colour=False)
     rects = view.rects[view.states == DRAWN]
     if not len(rects):
         return slice(0, 1), slice(0, 1)

@@ -15,7 +15,7 @@ from . import cpu
 from .bin import TileLists, tile_lists
 from .project import BLUE, RED
 from .surface import meet_range
-from .types import RasterSettings, Rendering
+from .types import Mask, RasterSettings, Rendering
 
 NUMBERS_ONLY = (False, False, True, False, False, True)  # blend_range's flags
 
@@ -24,19 +24,14 @@ class CpuDrawing:
     """See `Drawing`. Not for two threads at once."""
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        with_colour: bool,
-        pixels: np.ndarray | None,
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
     ) -> None:
         self.gaussians, self.camera, self.settings, self.with_colour = gaussians, camera, settings, with_colour
         self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
         self._view = view = cpu.project(gaussians, camera, settings, with_colour, self._slots)
         self._lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
 
-    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+    def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
         flags = cpu.pass_flags(passes)
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
@@ -45,7 +40,7 @@ class CpuDrawing:
         blocks = cpu.wanted_blocks(self.camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
         return self._draw(flags, self._wanted & blocks[self._slots >= 0])
 
-    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
         lists = self._lists if gone is None else _without(self._lists, gone)
         if self.gaussians.is_surfels:
             drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self._wanted, lists)

@@ -32,12 +32,7 @@ class CpuPixelRegion:
     """
 
     def __init__(
-        self,
-        frozen: Gaussians,
-        camera: Camera,
-        pixels: np.ndarray,
-        settings: RasterSettings,
-        passes: frozenset[str],
+        self, frozen: Gaussians, camera: Camera, pixels: np.ndarray, settings: RasterSettings, passes: frozenset[str]
     ) -> None:
         self.camera, self.settings, self.passes = camera, settings, passes
         self._flags = cpu.pass_flags(passes)
