@@ -25,7 +25,7 @@ MOST_ROWS = 32_000  # of a picture that cv2.remap makes; it refuses 32,768
 
 
 def framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which points [N, 3] lie in a view's frame: their indices [M], and the row, the column and the z at which they do."""
+    """Which points [N, 3] lie in a view's frame: their indices [M], and row, column and z where they do."""
     uv, z = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)

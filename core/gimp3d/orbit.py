@@ -122,7 +122,7 @@ def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` [3] that looks at `target`, `up` not along it."""
+    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`, `up` not along it."""
     forward = _unit(target - eye)
     right = _unit(np.cross(forward, up))
     rotation = np.stack([right, np.cross(forward, right), forward])
