@@ -204,45 +204,59 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
             log2_opacity, depth, red, green, blue, nx, ny, nz = shown_of(flat, o)
             if surfels:
                 x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
-            else:
-                x, y, xx, xy, yy = ellipse_of(flat, o)
-                along0, down0 = fma16(column, xx, row * xy), row * yy
-            x, y = float32(left) + HALF - x, float32(top) + HALF - y
-            disparity = distortion_near / depth
-            z, m = splat16(depth - shift), splat16(disparity - disparity_shift)
-            while mask:
-                b, mask = next_bit(mask)
-                k = b * BLOCK_STATE
-                corner_x, corner_y = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
-                if surfels:
-                    dx, dy = column + corner_x, row + corner_y
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
+                disparity = distortion_near / depth
+                while mask:
+                    b, mask = next_bit(mask)
+                    k = b * BLOCK_STATE
+                    dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
                     u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
                     den = fma16(dx, a_x, fma16(dy, a_y, one))
                     _, alpha, inverse, blurred = surfel_alpha(
                         u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
                     )
-                    z = where_greater(blurred, ZERO, splat16(depth), inverse * depth) - shift
-                    m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
-                else:
-                    along, down = along0 + (corner_x * xx + corner_y * xy), down0 + corner_y * yy
-                    _, alpha = ellipse_alpha(along, down, log2_opacity, alpha_min, alpha_max)
-                before = load16(state, k + T)
-                weight = alpha * before
-                after = before - weight
-                store16(state, k + T, after)
-                if with_rgb:
-                    _add_three(state, k + R, weight, red, green, blue)
-                if with_depth:
-                    store16(state, k + Z, fma16(weight, z, load16(state, k + Z)))
-                if with_median:
-                    crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
-                    store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
-                if with_normals:
-                    _add_three(state, k + NX, weight, nx, ny, nz)
-                if with_distortion:
-                    moment = weight * m
-                    store16(state, k + M1, load16(state, k + M1) + moment)
-                    store16(state, k + M2, fma16(moment, m, load16(state, k + M2)))
+                    before = load16(state, k + T)
+                    weight = alpha * before
+                    after = before - weight
+                    store16(state, k + T, after)
+                    if with_rgb:
+                        _add_three(state, k + R, weight, red, green, blue)
+                    if with_depth:
+                        z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
+                        store16(state, k + Z, fma16(weight, z - shift, load16(state, k + Z)))
+                    if with_median:
+                        _mark_median(state, k, before, after, number)
+                    if with_normals:
+                        _add_three(state, k + NX, weight, nx, ny, nz)
+                    if with_distortion:
+                        m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
+                        _add_disparity(state, k, weight, m)
+            else:
+                x, y, xx, xy, yy = ellipse_of(flat, o)
+                x, y = float32(left) + HALF - x, float32(top) + HALF - y
+                along0, down0 = fma16(column, xx, row * xy), row * yy
+                m = splat16(distortion_near / depth - disparity_shift)
+                while mask:
+                    b, mask = next_bit(mask)
+                    k = b * BLOCK_STATE
+                    dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
+                    _, alpha = ellipse_alpha(
+                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
+                    )
+                    before = load16(state, k + T)
+                    weight = alpha * before
+                    after = before - weight
+                    store16(state, k + T, after)
+                    if with_rgb:
+                        _add_three(state, k + R, weight, red, green, blue)
+                    if with_depth:
+                        store16(state, k + Z, fma16(weight, depth - shift, load16(state, k + Z)))
+                    if with_median:
+                        _mark_median(state, k, before, after, number)
+                    if with_normals:
+                        _add_three(state, k + NX, weight, nx, ny, nz)
+                    if with_distortion:
+                        _add_disparity(state, k, weight, m)
             i += 1
             if (i - first) % CHECK == 0:
                 alive, closing = _close(state, BLOCK_STATE, alive, float32(i - first), stop)
@@ -260,6 +274,19 @@ def _add_three(state, k, weight, a, b, c):
     store16(state, k, fma16(weight, a, load16(state, k)))
     store16(state, k + 16, fma16(weight, b, load16(state, k + 16)))
     store16(state, k + 32, fma16(weight, c, load16(state, k + 32)))
+
+
+@inline_kernel
+def _mark_median(state, k, before, after, number):
+    crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
+    store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
+
+
+@inline_kernel
+def _add_disparity(state, k, weight, m):
+    moment = weight * m
+    store16(state, k + M1, load16(state, k + M1) + moment)
+    store16(state, k + M2, fma16(moment, m, load16(state, k + M2)))
 
 
 @inline_kernel
