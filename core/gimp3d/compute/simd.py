@@ -169,7 +169,13 @@ def _block_loader(channels: int, channel: int) -> Any:
 
 # A block's 4 rows from array[index + row · stride : …]: 4 values each, or one channel of 4 triples.
 load_block = _block_loader(1, 0)
-load_block_x, load_block_y, load_block_z = (_block_loader(3, c) for c in range(3))
+_load_x, _load_y, _load_z = (_block_loader(3, c) for c in range(3))
+
+
+@inline_kernel
+def load_block3(array, index, stride):
+    """A block's 4 rows of 4 triples from array[index + row · stride : … + 12], as store_block3 leaves them."""
+    return _load_x(array, index, stride), _load_y(array, index, stride), _load_z(array, index, stride)
 
 
 @intrinsic

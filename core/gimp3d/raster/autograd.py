@@ -29,11 +29,11 @@ PICTURES = tuple(f.name for f in fields(Pictures))
 
 
 def rasterize(
-    means: torch.Tensor,  # [N, 3]
-    log_scales: torch.Tensor,  # [N, 3], or [N, 2] for surfels
-    quats: torch.Tensor,  # [N, 4] wxyz
-    opacity_logits: torch.Tensor,  # [N]
-    sh: torch.Tensor,  # [N, K, 3]
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quats: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
     view: Camera | PixelRegion,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
@@ -41,18 +41,9 @@ def rasterize(
 ) -> Pictures:
     """Draw Gaussians so that a loss on the pictures flows back to them.
 
-    Parameters
-    ----------
-    means, log_scales, quats, opacity_logits, sh
-        Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
-        forward and backward: torch checks that.
-    view
-        A camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
-
-    Raises
-    ------
-    ValueError
-        If a tensor is of another type, on another device or not contiguous (it would have to be copied).
+    The first five are raw values as in `Gaussians`, contiguous float32 tensors on the CPU, or else a ValueError (they
+    would have to be copied). They must not be changed in place between forward and backward: torch checks that. `view`
+    is a camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
     """
     tensors = (means, log_scales, quats, opacity_logits, sh)
     for name, t in zip(ARRAYS, tensors):
@@ -66,7 +57,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor, ...]:
         *tensors, view, settings, passes, antialiased = args
-        gaussians = Gaussians(*(t.detach().numpy() for t in tensors), antialiased)
+        gaussians = Gaussians(*(t.detach().numpy() for t in tensors), antialiased=antialiased)
         if isinstance(view, Camera):
             rendering, ctx.traced = trace(gaussians, view, settings, passes)
         else:

@@ -28,7 +28,7 @@ from ..compute.simd import (
     where_greater,
 )
 from ..compute.threads import parallel_map, run_ranges, thread_count
-from .project import DEPTH, DRAWN, HALF, HALF_HEIGHT, HIDDEN, TILE, ZERO, ellipse_of
+from .project import DEPTH, DRAWN, HALF, HALF_HEIGHT, HIDDEN, TILE, ZERO, Projected, ellipse_of
 
 AHEAD = 16  # rows to prefetch: in depth order each is a cache miss
 CELLS = 8  # a mask has a bit for each of 8×8 cells
@@ -51,13 +51,12 @@ class TileLists:
     spans: np.ndarray  # [N, 2] int64: a Gaussian's rows for sums are spans[g, 0] … spans[g, 1] − 1; or empty
 
 
-def tile_lists(
-    features: np.ndarray, rects: np.ndarray, states: np.ndarray, slots: np.ndarray, with_records: bool
-) -> TileLists:
+def tile_lists(view: Projected, slots: np.ndarray, with_records: bool) -> TileLists:
     """Deal the drawn Gaussians into the wanted tiles; the states of those that reach none become HIDDEN.
 
-    The first three arrays are project_range's; `slots` [down, across] int32: a tile's slot, −1 where it is not wanted.
+    `slots` [down, across] int32: a tile's slot, −1 where it is not wanted.
     """
+    features, rects, states = view.features, view.rects, view.states
     tiles = np.flatnonzero(slots.ravel() >= 0).astype(np.int32)
     if len(tiles) < slots.size:
         sums = np.zeros((slots.shape[0] + 1, slots.shape[1] + 1), np.int32)
@@ -235,12 +234,10 @@ def _deal(lo, hi, order, features, rects, ordered, masks, slots, places, entries
         x0, y0, x1, y1 = rect & 0xFFFF, (rect >> 16) & 0xFFFF, (rect >> 32) & 0xFFFF, (rect >> 48) & 0xFFFF
         first = record
         # of one row or column of tiles the bound reaches every one
-        if x1 - x0 == 1:
+        if x1 - x0 == 1 or y1 - y0 == 1:
             for v in range(y0, y1):
-                record = _put(slots[v, x0], g, record, counting, recording, places, entries, records)
-        elif y1 - y0 == 1:
-            for u in range(x0, x1):
-                record = _put(slots[y0, u], g, record, counting, recording, places, entries, records)
+                for u in range(x0, x1):
+                    record = _put(slots[v, u], g, record, counting, recording, places, entries, records)
         else:
             small = x1 - x0 <= CELLS and y1 - y0 <= CELLS  # one mask holds all
             for top in range(y0, y1, CELLS):

@@ -63,18 +63,20 @@ def aligned_empty(size):
 
 
 @inline_kernel
-def ellipse_alpha(along, down, log2_opacity, alpha_min, alpha_max):
-    """(alpha before it is capped, alpha) of a 3D Gaussian at whitened offsets."""
+def ellipse_alpha(along, down, log2_opacity, limits):
+    """(alpha before it is capped, alpha) of a 3D Gaussian at whitened offsets; limits as blend_range's."""
     free = exp2_16(log2_opacity - fma16(along, along, down * down))
-    return free, where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
+    return free, where_greater(free, limits[0], min16(free, limits[1]), ZERO)
 
 
 @inline_kernel
-def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max):
-    """(alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass decides as 1 or 0) of a surfel.
-
-    u, v and den are U·δ, V·δ and 1 + A·δ (Huang 2024, eq. 8–11).
-    """
+def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
+    """U·δ, V·δ, 1 + A·δ (Huang 2024, eq. 8–11), alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass
+    decides as 1 or 0, of surfel_of a row, at offsets δ = (dx, dy)."""
+    _, _, u_x, u_y, v_x, v_y, a_x, a_y = surfel
+    alpha_min, alpha_max, _, near, disc, _ = limits
+    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
+    den = fma16(dx, a_x, fma16(dy, a_y, splat16(ONE)))
     inverse = where_greater(den, HORIZON, ONE / den, ZERO)  # no hit behind the camera
     near_plane = depth / near  # den beyond which the surfel lies before the near plane
     squared = fma16(u, u, v * v) * inverse * inverse
@@ -82,20 +84,21 @@ def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, 
     low_pass = fma16(dx, dx, dy * dy) * disc
     free = exp2_16(log2_opacity - min16(low_pass, squared))
     alpha = where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
-    return free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
+    return u, v, den, free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
 
 
 @exact_kernel
-def region_blocks(pixels, across, blocks):
-    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [T] uint64 out."""
-    for t in range(len(blocks)):
-        blocks[t] = open_blocks(pixels, t % across * TILE, t // across * TILE, pixels.shape[1], pixels.shape[0])
+def region_blocks(pixels, blocks):
+    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [down, across] uint64 out."""
+    for row in range(blocks.shape[0]):
+        for column in range(blocks.shape[1]):
+            blocks[row, column] = open_blocks(pixels, column * TILE, row * TILE)
 
 
 @inline_kernel
-def open_blocks(pixels, left, top, width, height):
+def open_blocks(pixels, left, top):
     """A mask of the tile's blocks that have a wanted pixel."""
-    mask = uint64(0)
+    mask, (height, width) = uint64(0), pixels.shape
     for v in range(top, min(top + TILE, height)):
         for u in range(left, min(left + TILE, width)):
             if pixels[v, u]:
@@ -172,7 +175,7 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
     tiles, across, width, starts, stops, entries = lists
     features, surfels, limits, wanted, shifts, background, back = given
     masks, closings, ends, states = kept
-    alpha_min, alpha_max, stop, near, disc, distortion_near = limits
+    _, _, stop, _, _, distortion_near = limits
     with_rgb, with_depth, with_median, with_normals, with_distortion, _ = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
@@ -203,18 +206,14 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
             number = splat16(float32(i - first + 1))
             log2_opacity, depth, red, green, blue, nx, ny, nz = shown_of(flat, o)
             if surfels:
-                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
-                x, y = float32(left) + HALF - x, float32(top) + HALF - y
+                surfel = surfel_of(flat, o)
+                x, y = float32(left) + HALF - surfel[0], float32(top) + HALF - surfel[1]
                 disparity = distortion_near / depth
                 while mask:
                     b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    _, alpha, inverse, blurred = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    _, _, den, _, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     before = load16(state, k + T)
                     weight = alpha * before
                     after = before - weight
@@ -240,9 +239,8 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
                     b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
-                    _, alpha = ellipse_alpha(
-                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
-                    )
+                    along, down = along0 + (dx * xx + dy * xy), down0 + dy * yy
+                    _, alpha = ellipse_alpha(along, down, log2_opacity, limits)
                     before = load16(state, k + T)
                     weight = alpha * before
                     after = before - weight
@@ -375,7 +373,7 @@ def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
     of each list entry over the pixels of a label, and `peaks` [P], their maximum. The others as for blend_range.
     """
     tiles, across, _, starts, stops, entries = lists
-    alpha_min, alpha_max, stop, near, disc, _ = limits
+    stop = limits[2]
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     height, width = labels.shape
@@ -395,7 +393,7 @@ def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
                     label = int64(labels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x])
                     if 0 < label <= kinds:
                         state[k + COUNTED + 16 * (label - 1) + 4 * y + x] = ONE
-        alive = open_blocks(labels, left, top, width, height)
+        alive = open_blocks(labels, left, top)
         first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size
@@ -412,18 +410,14 @@ def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
                 x = float32(left) + HALF + BLOCK_PX * float32(b & 7)
                 y = float32(top) + HALF + BLOCK_PX * float32(b >> 3)
                 if surfels:
-                    centre_x, centre_y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
-                    dx, dy = column + (x - centre_x), row + (y - centre_y)
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    _, alpha, _, _ = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    surfel = surfel_of(flat, o)
+                    dx, dy = column + (x - surfel[0]), row + (y - surfel[1])
+                    _, _, _, _, alpha, _, _ = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                 else:
                     centre_x, centre_y, xx, xy, yy = ellipse_of(flat, o)
                     dx, dy = column + (x - centre_x), row + (y - centre_y)
                     along = fma16(dx, xx, dy * xy)
-                    _, alpha = ellipse_alpha(along, dy * yy, log2_opacity, alpha_min, alpha_max)
+                    _, alpha = ellipse_alpha(along, dy * yy, log2_opacity, limits)
                 before = load16(state, k + T)
                 weight = alpha * before
                 store16(state, k + T, before - weight)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..gaussians import ARRAYS, Gaussians
 from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
-from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, UNUSABLE, project_range
+from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, Projected, project_range
 from .types import PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
@@ -25,19 +26,6 @@ NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
 NO_PICTURES = (np.empty(0, np.float32),) * 6
 CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
-
-
-@dataclass(frozen=True)
-class Projected:
-    """Gaussians projected into a camera."""
-
-    features: np.ndarray  # [N, 16 or 32] float32
-    rects: np.ndarray  # [N, 4] int16
-    states: np.ndarray  # [N] int8
-
-    @property
-    def ignored(self) -> int:
-        return int(np.count_nonzero(self.states == UNUSABLE))
 
 
 def project(
@@ -52,7 +40,7 @@ def project(
     announce_compilation()
     n, low_pass = len(gaussians), settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass
     if features is None:
-        features = np.empty((n, row_size(gaussians)), np.float32)
+        features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
     out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
     grid = tile_grid(camera)
     tiles = np.array([*((0, 0, *grid) if slots is None else _rectangle(slots >= 0)), *grid], np.int64)
@@ -60,10 +48,6 @@ def project(
     given = values_of(gaussians), pack_camera(camera), tiles, limits, with_colour
     run_ranges(project_range, n, *given, out.features, out.rects, out.states)
     return out
-
-
-def row_size(gaussians: Gaussians) -> int:
-    return SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW
 
 
 def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
@@ -100,13 +84,7 @@ def pack_camera(camera: Camera) -> np.ndarray:
 
 
 def pass_flags(passes: frozenset[str]) -> tuple[bool, ...]:
-    """blend_range's flags.
-
-    Raises
-    ------
-    ValueError
-        If a pass is unknown.
-    """
+    """blend_range's flags; a ValueError if a pass is unknown."""
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
@@ -152,32 +130,27 @@ def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int)
     return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
 
 
-def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
-    across, down = tile_grid(camera)
-    columns = np.minimum(-(-(camera.width - TILE * np.arange(across)) // 4), 8).astype(np.uint64)
-    rows = np.minimum(-(-(camera.height - TILE * np.arange(down)) // 4), 8).astype(np.uint64)
-    first_column = np.uint64(0x0101010101010101) >> (np.uint64(64) - np.uint64(8) * rows)
-    wanted = ((np.uint64(1) << columns) - np.uint64(1))[None] * first_column[:, None]
-    return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
-
-
 def wanted_tiles(camera: Camera, pixels: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
+    """Slots [down, across] int32 of the tiles, and blocks [S] uint64 of each slot, with wanted pixels [H, W] bool."""
     if pixels is None:
-        return whole_picture(camera)
+        return _all_tiles(camera.height, camera.width)
     if pixels.shape != (camera.height, camera.width):
         raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
-    blocks = wanted_blocks(camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
+    blocks = wanted_blocks(pixels)
     return slots_of(blocks > 0), blocks[blocks > 0]
 
 
-def wanted_blocks(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] uint8 which is not 0."""
-    across, down = tile_grid(camera)
-    blocks = np.empty(across * down, np.uint64)
-    region_blocks(pixels, across, blocks)
-    return blocks.reshape(down, across)
+@lru_cache(maxsize=16)
+def _all_tiles(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    blocks = wanted_blocks(np.ones((height, width), bool))
+    return slots_of(blocks > 0), blocks.ravel()
+
+
+def wanted_blocks(pixels: np.ndarray) -> np.ndarray:
+    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] which is not 0."""
+    blocks = np.empty([-(-side // TILE) for side in pixels.shape], np.uint64)
+    region_blocks(np.require(pixels, bool, ["C", "W"]).view(np.uint8), blocks)
+    return blocks
 
 
 def slots_of(wanted: np.ndarray) -> np.ndarray:
@@ -235,15 +208,26 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
+def prepare(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: RasterSettings,
+    flags: tuple[bool, ...],
+    pixels: Mask,
+    with_records: bool,
+) -> Trace:
+    """All that is done before blending."""
+    slots, wanted = wanted_tiles(camera, pixels)
+    view = project(gaussians, camera, settings, flags[0], slots)
+    lists = tile_lists(view, slots, with_records)
+    shifts = depth_shifts(lists, view.features)
+    return Trace(gaussians, view, camera, settings, flags, lists, view.features, wanted, shifts)
+
+
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    flags = pass_flags(passes)
-    slots, wanted = whole_picture(camera)
-    view = project(gaussians, camera, settings, flags[0], slots)
-    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=True)
-    shifts = depth_shifts(lists, view.features)
-    return blend(Trace(gaussians, view, camera, settings, flags, lists, view.features, wanted, shifts), keep=True)
+    return blend(prepare(gaussians, camera, settings, pass_flags(passes), None, with_records=True), keep=True)
 
 
 def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Rendering, Trace]:
@@ -298,12 +282,12 @@ def _weigh(
         raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
     counted = np.require(labels, np.uint8, ["C", "W"])
-    wanted = wanted_blocks(camera, counted) > 0
+    wanted = wanted_blocks(counted) > 0
     if rows is not None:
         touched = np.zeros(wanted.shape, bool)
         mark_touched(view.rects, view.states, rows, touched)
         wanted &= touched
-    lists = tile_lists(view.features, view.rects, view.states, slots_of(wanted), with_records=False)
+    lists = tile_lists(view, slots_of(wanted), with_records=False)
     sums, peaks = np.zeros((count, len(lists.entries)), np.float32), np.zeros(len(lists.entries), np.float32)
     limits = pack_limits(settings)
     over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)

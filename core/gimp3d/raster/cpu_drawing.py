@@ -12,7 +12,7 @@ from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
 from ..gaussians import Gaussians
 from . import cpu
-from .bin import TileLists, tile_lists
+from .bin import TileLists
 from .project import BLUE, RED
 from .surface import meet_range
 from .types import Mask, RasterSettings, Rendering
@@ -26,29 +26,29 @@ class CpuDrawing:
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
     ) -> None:
-        self.gaussians, self.camera, self.settings, self.with_colour = gaussians, camera, settings, with_colour
-        self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
-        self._view = view = cpu.project(gaussians, camera, settings, with_colour, self._slots)
-        self._lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
+        self.gaussians, self.camera, self.with_colour = gaussians, camera, with_colour
+        flags = (with_colour, False, False, False, False, False)
+        self._made = cpu.prepare(gaussians, camera, settings, flags, pixels, with_records=False)
 
     def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
         flags = cpu.pass_flags(passes)
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
         if pixels is None:
-            return self._draw(flags, self._wanted)
-        blocks = cpu.wanted_blocks(self.camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
-        return self._draw(flags, self._wanted & blocks[self._slots >= 0])
+            return self._draw(flags)
+        there = cpu.wanted_blocks(pixels).ravel()[self._made.lists.tiles]
+        return self._draw(flags, wanted=self._made.wanted & there)
 
     def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
-        lists = self._lists if gone is None else _without(self._lists, gone)
+        lists = self._made.lists if gone is None else _without(self._made.lists, gone)
+        shifts = cpu.depth_shifts(lists, self._made.features)
         if self.gaussians.is_surfels:
-            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self._wanted, lists)
+            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), lists=lists, shifts=shifts)
             return drawn.median_depth, drawn.alpha
-        drawn = self._draw(NUMBERS_ONLY, self._wanted, lists)
+        drawn = self._draw(NUMBERS_ONLY, lists=lists, shifts=shifts)
         depth, numbers = np.zeros(drawn.alpha.shape, np.float32), drawn.median_depth.view(np.int32)
         means, log_scales, quats, _, _ = cpu.values_of(self.gaussians)
-        camera, low_pass = cpu.pack_camera(self.camera), float(self.settings.low_pass)
+        camera, low_pass = cpu.pack_camera(self.camera), float(self._made.settings.low_pass)
         run_ranges(meet_range, len(depth), numbers, means, log_scales, quats, camera, low_pass, depth)
         return depth, drawn.alpha
 
@@ -57,18 +57,12 @@ class CpuDrawing:
             raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {chosen.shape}")
         if self.with_colour:
             raise ValueError("footprint: this drawing has colours; make one without")
-        _paint(self._lists.entries, chosen, self._view.features)
-        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), self._wanted, background=(0.0, 0.0, 0.0))
-        return np.ascontiguousarray(drawn.rgb[..., 0])
+        _paint(self._made.lists.entries, chosen, self._made.features)
+        black = replace(self._made.settings, background=(0.0, 0.0, 0.0))
+        return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb[..., 0])
 
-    def _draw(
-        self, flags: tuple[bool, ...], wanted: np.ndarray, lists: TileLists | None = None, **changed: Any
-    ) -> Rendering:
-        """Draw the wanted blocks, of the drawing's lists and with its settings where no others are given."""
-        view, lists, settings = self._view, lists or self._lists, replace(self.settings, **changed)
-        shifts = cpu.depth_shifts(lists, view.features)
-        traced = cpu.Trace(self.gaussians, view, self.camera, settings, flags, lists, view.features, wanted, shifts)
-        return cpu.blend(traced, keep=False)[0]
+    def _draw(self, flags: tuple[bool, ...], **changed: Any) -> Rendering:
+        return cpu.blend(replace(self._made, flags=flags, **changed), keep=False)[0]
 
 
 def _without(lists: TileLists, gone: np.ndarray) -> TileLists:

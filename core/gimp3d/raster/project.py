@@ -8,6 +8,7 @@ scenes may lie far from the origin, and a giant's covariance would overflow floa
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import float32, float64, int32, int64
@@ -55,6 +56,19 @@ OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2,
 )
 OUT_CENTRE_X, _, _, OUT_UY, _, _, OUT_AX, OUT_AY = range(22 * CHUNK, 30 * CHUNK, CHUNK)  # as in a feature row
 PLANES = 30
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Gaussians projected into a camera."""
+
+    features: np.ndarray  # [N, 16 or 32] float32
+    rects: np.ndarray  # [N, 4] int16
+    states: np.ndarray  # [N] int8
+
+    @property
+    def ignored(self) -> int:
+        return int(np.count_nonzero(self.states == UNUSABLE))
 
 
 @inline_kernel

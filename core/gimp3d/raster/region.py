@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from . import cpu
 from .bin import TileLists, tile_lists
 from .blend import TILE_STATE, blend_range
-from .project import DEPTH
+from .project import DEPTH, Projected
 from .types import Gradients, PictureGradients, RasterSettings, Rendering
 
 SLAB_MARGIN = 0.02  # of the depth: how far active Gaussians may move before layers are made anew
@@ -26,7 +26,7 @@ WORTH_LAYERS = 0.5  # a tile gets layers if its slab holds fewer of its frozen e
 
 
 class CpuPixelRegion:
-    """Wanted pixels of a view over a frozen scene. Not for two threads at once.
+    """See `PixelRegion`. Not for two threads at once.
 
     The layers need no median depth: with the pass `depth`, everything in the tiles is blended every time.
     """
@@ -39,7 +39,7 @@ class CpuPixelRegion:
         self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
         view = cpu.project(frozen, camera, settings, self._flags[0])
         self._ignored = view.ignored
-        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
+        lists = tile_lists(view, self._slots, with_records=False)
         rows, entries = np.unique(lists.entries, return_inverse=True)
         self._frozen_count, self._surfels = len(rows), frozen.is_surfels
         self._features = view.features[rows]
@@ -54,11 +54,9 @@ class CpuPixelRegion:
         self._renderings = 0
 
     def render(self, active: Gaussians) -> Rendering:
-        """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
         return self._draw(active, keep=False)[0]
 
     def trace(self, active: Gaussians) -> tuple[Rendering, RegionTrace]:
-        """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
         return self._draw(active, keep=True)
 
     def _draw(self, active: Gaussians, keep: bool) -> tuple[Rendering, RegionTrace]:
@@ -71,7 +69,7 @@ class CpuPixelRegion:
             self._features[:frozen] = before[:frozen]
         drawn = self._features[frozen:]
         view = cpu.project(active, self.camera, self.settings, self._flags[0], features=drawn)
-        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=keep)
+        lists = tile_lists(view, self._slots, with_records=keep)
         if len(self._front):
             self._renew_layers(view, lists)
         given = self._flags, self._merge(view, lists), self._features, self._wanted, self._shifts, self._back
@@ -79,7 +77,7 @@ class CpuPixelRegion:
         picture = replace(picture, ignored=self._ignored + picture.ignored)
         return picture, RegionTrace(self, self._renderings, kept)
 
-    def _renew_layers(self, view: cpu.Projected, lists: TileLists) -> None:
+    def _renew_layers(self, view: Projected, lists: TileLists) -> None:
         """Make the layers of tiles whose active Gaussians have left the slab of depths that they were made for."""
         filled = np.flatnonzero(lists.stops > lists.starts)
         near, far = np.full((2, len(lists.tiles)), np.nan, np.float32)
@@ -111,7 +109,7 @@ class CpuPixelRegion:
         cpu.over_tiles(blend_range, lists, self.camera, given, kept, self._flags, cpu.NO_STATES, cpu.NO_PICTURES)
         return states
 
-    def _merge(self, view: cpu.Projected, lists: TileLists) -> TileLists:
+    def _merge(self, view: Projected, lists: TileLists) -> TileLists:
         """Frozen entries of the slabs and active ones in one list, by depth, frozen first where that is equal."""
         counts = (self._slab_stops - self._slab_starts) + (lists.stops - lists.starts)
         stops = np.cumsum(counts)
@@ -132,13 +130,8 @@ class RegionTrace:
     traced: cpu.Trace
 
     def backward(self, gradients: PictureGradients) -> Gradients:
-        """The gradient with respect to the active Gaussians.
-
-        Raises
-        ------
-        RuntimeError
-            If the region has been rendered again: its rows are those of the later rendering.
-        """
+        """The gradient with respect to the active Gaussians; a RuntimeError if the region has been rendered again, as
+        its rows are those of the later rendering."""
         if self.region._renderings != self.rendering:
             raise RuntimeError("backward: the region has been rendered again since")
         return self.traced.backward(gradients)

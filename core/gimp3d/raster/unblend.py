@@ -18,9 +18,7 @@ from ..compute.simd import (
     fma16,
     load16,
     load_block,
-    load_block_x,
-    load_block_y,
-    load_block_z,
+    load_block3,
     max16,
     next_bit,
     prefetch,
@@ -76,7 +74,7 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
     tiles, across, width, starts, stops, entries = lists
     features, surfels, limits, wanted, shifts, background, back = given
     masks, closings, ends, states = kept
-    alpha_min, alpha_max, _, near, disc, distortion_near = limits
+    _, alpha_max, _, _, disc, distortion_near = limits
     with_rgb, with_depth, with_median, with_normals, with_distortion = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
@@ -103,7 +101,8 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
             s_red, s_green, s_blue, s_depth, s_log = none, none, none, none, none
             s_nx, s_ny, s_nz = none, none, none
             if surfels:
-                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+                surfel = surfel_of(flat, o)
+                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 disparity = distortion_near / depth
                 s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy = none, none, none, none, none, none, none, none
@@ -111,11 +110,7 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                     b, mask = next_bit(mask)
                     k = b * BACK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    free, alpha, inverse, blurred = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    u, v, den, free, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     z = where_greater(blurred, ZERO, splat16(depth), inverse * depth) - shift
                     m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                     value = load16(work, k + G_W)
@@ -175,9 +170,8 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                     b, mask = next_bit(mask)
                     k = b * BACK_STATE
                     dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
-                    free, alpha = ellipse_alpha(
-                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
-                    )
+                    along, down = along0 + (dx * xx + dy * xy), down0 + dy * yy
+                    free, alpha = ellipse_alpha(along, down, log2_opacity, limits)
                     value = load16(work, k + G_W)
                     if with_rgb:
                         value = _three(work, k, G_R, red, green, blue, value)
@@ -281,9 +275,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
             g_w = load_block(d_alpha, o, width)
         behind = splat16(ZERO)  # what shows where no Gaussian is left
         if flags[0]:
-            g_red = load_block_x(d_rgb, 3 * o, 3 * width)
-            g_green = load_block_y(d_rgb, 3 * o, 3 * width)
-            g_blue = load_block_z(d_rgb, 3 * o, 3 * width)
+            g_red, g_green, g_blue = load_block3(d_rgb, 3 * o, 3 * width)
             behind = fma16(g_red, background[0], fma16(g_green, background[1], g_blue * background[2]))
             store16(work, w + G_R, g_red)
             store16(work, w + G_G, g_green)
@@ -296,9 +288,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
         if flags[3]:
             nx, ny, nz, inverse = total_normal(state, back, slot, k, clear)
             nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
-            g_x = load_block_x(d_normals, 3 * o, 3 * width)
-            g_y = load_block_y(d_normals, 3 * o, 3 * width)
-            g_n = load_block_z(d_normals, 3 * o, 3 * width)
+            g_x, g_y, g_n = load_block3(d_normals, 3 * o, 3 * width)
             along = fma16(g_x, nx, fma16(g_y, ny, g_n * nz))
             store16(work, w + G_NX, (g_x - along * nx) * inverse)
             store16(work, w + G_NY, (g_y - along * ny) * inverse)
