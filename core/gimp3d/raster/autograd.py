@@ -57,7 +57,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor, ...]:
         *tensors, view, settings, passes, antialiased = args
-        gaussians = Gaussians(*(t.detach().numpy() for t in tensors), antialiased=antialiased)
+        gaussians = Gaussians(**{n: t.detach().numpy() for n, t in zip(ARRAYS, tensors)}, antialiased=antialiased)
         if isinstance(view, Camera):
             rendering, ctx.traced = trace(gaussians, view, settings, passes)
         else:

@@ -19,7 +19,6 @@ from ..compute.simd import (
     highest16,
     load1,
     load16,
-    lowest_bit,
     max16,
     min16,
     next_bit,
@@ -121,9 +120,8 @@ def _close(state, size, mask, entry, stop):
     those in which some were closed."""
     still, closing = uint64(0), uint64(0)
     while mask:
-        b = lowest_bit(mask)
-        bit = mask & (~mask + uint64(1))
-        mask ^= bit
+        b, mask = next_bit(mask)
+        bit = uint64(1) << uint64(b)
         k = b * size
         t = load16(state, k + T)
         if any_between(t, ZERO, stop):
@@ -146,9 +144,8 @@ def _open(state, mask, stop):
     _, _ = _close(state, BLOCK_STATE, mask, ZERO, stop)
     still = uint64(0)
     while mask:
-        b = lowest_bit(mask)
-        bit = mask & (~mask + uint64(1))
-        mask ^= bit
+        b, mask = next_bit(mask)
+        bit = uint64(1) << uint64(b)
         store16(state, b * BLOCK_STATE + CLOSED, splat16(ZERO))
         if highest16(load16(state, b * BLOCK_STATE + T)) > ZERO:
             still |= bit

@@ -181,8 +181,12 @@ class Trace:
         return self.features, surfels, limits, self.wanted, self.shifts, background, self.back
 
     def backward(self, gradients: PictureGradients) -> Gradients:
-        check_gradients(gradients, self.camera)
-        given = tuple(padded(getattr(gradients, f.name), self.camera) for f in fields(gradients))
+        camera, pictures = self.camera, {f.name: getattr(gradients, f.name) for f in fields(gradients)}
+        for name, picture in pictures.items():
+            expected = (camera.height, camera.width, *((3,) if name in ("rgb", "normals") else ()))
+            if picture.size and picture.shape != expected:
+                raise ValueError(f"gradient of {name}: expected shape {expected}, got {picture.shape}")
+        given = tuple(padded(picture, camera) for picture in pictures.values())
         flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4, 5))
         names = ("rgb", "expected_depth", "median_depth", "normals", "distortion")
         missing = [name for name, wanted, drawn in zip(names, flags, self.flags) if wanted and not drawn]
@@ -190,10 +194,10 @@ class Trace:
             raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
         records = np.empty(len(self.lists.records) * RECORD, np.float32)
         active = len(self.features) - len(self.gaussians), self.lists.records, records
-        over_tiles(unblend_range, self.lists, self.camera, self.given(), self.kept, flags, given, *active)
+        over_tiles(unblend_range, self.lists, camera, self.given(), self.kept, flags, given, *active)
         values = values_of(self.gaussians)
         found = tuple(np.zeros(v.shape, np.float32) for v in values)
-        how = pack_camera(self.camera), float(self.settings.low_pass), bool(self.gaussians.antialiased)
+        how = pack_camera(camera), float(self.settings.low_pass), bool(self.gaussians.antialiased)
         drawn = self.view.features, self.view.states, self.lists.spans, records
         run_ranges(unproject_range, len(self.gaussians), values, *how, *drawn, found)
         return Gradients(*found)
@@ -242,15 +246,6 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
     pictures = empty_pictures(traced.camera, traced.flags)
     over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, traced.flags, front, pictures)
     return as_rendering(pictures, traced.camera, traced.view.ignored), replace(traced, kept=kept)
-
-
-def check_gradients(given: PictureGradients, camera: Camera) -> None:
-    """Every picture's gradient is empty or has the picture's shape."""
-    for f in fields(given):
-        value = getattr(given, f.name)
-        expected = (camera.height, camera.width, *((3,) if f.name in ("rgb", "normals") else ()))
-        if value.size and value.shape != expected:
-            raise ValueError(f"gradient of {f.name}: expected shape {expected}, got {value.shape}")
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
