@@ -31,11 +31,8 @@ ROUNDING = 1.5 * 2.0**23  # added to a float32 it leaves the nearest integer in 
 class Vec16Type(types.Type):
     """numba's type of a 16-lane vector."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Vec16")
 
-
-vec16 = Vec16Type()
+vec16 = Vec16Type(name="Vec16")
 f32 = types.float32
 
 
@@ -306,7 +303,7 @@ def next_bit(mask):
     return lowest_bit(mask), mask & (mask - types.uint64(1))
 
 
-def _reduction(combine: Any) -> Any:
+def _reduction(combine: Callable[..., Any]) -> Any:
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value, lanes = args[0], LANES
         while lanes > 1:  # halves, so that the order of additions is fixed
@@ -315,19 +312,11 @@ def _reduction(combine: Any) -> Any:
             value = combine(builder, low, high)
         return builder.extract_element(value, I32(0))
 
-    return code
+    return intrinsic(lambda typing, x: (f32(vec16), code))
 
 
-@intrinsic
-def sum16(typing: Any, x: Any) -> Any:
-    """The sum of the lanes, always in the same order."""
-    return f32(vec16), _reduction(lambda builder, low, high: builder.fadd(low, high))
-
-
-@intrinsic
-def highest16(typing: Any, x: Any) -> Any:
-    """The largest lane."""
-    return f32(vec16), _reduction(_larger)
+# The sum of the lanes, always in the same order, and the largest lane
+sum16, highest16 = _reduction(lambda builder, low, high: builder.fadd(low, high)), _reduction(_larger)
 
 
 @intrinsic

@@ -25,11 +25,9 @@ class PixelRegion(Protocol):
 
     def render(self, active: Gaussians) -> Rendering:
         """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
-        ...
 
     def trace(self, active: Gaussians) -> tuple[Rendering, Trace]:
         """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
-        ...
 
 
 class Drawing(Protocol):
@@ -37,15 +35,12 @@ class Drawing(Protocol):
 
     def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
         """As `render`; of the drawing's own pixels only those given."""
-        ...
 
     def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
         """As `surface_depth`, without some Gaussians ([N] bool)."""
-        ...
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
         """As `footprint`; only for drawings without colours."""
-        ...
 
 
 class Backend(Protocol):

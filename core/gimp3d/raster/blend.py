@@ -89,20 +89,14 @@ def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
 @exact_kernel
 def region_blocks(pixels, blocks):
     """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [down, across] uint64 out."""
-    for row in range(blocks.shape[0]):
-        for column in range(blocks.shape[1]):
-            blocks[row, column] = open_blocks(pixels, column * TILE, row * TILE)
-
-
-@inline_kernel
-def open_blocks(pixels, left, top):
-    """A mask of the tile's blocks that have a wanted pixel."""
-    mask, (height, width) = uint64(0), pixels.shape
-    for v in range(top, min(top + TILE, height)):
-        for u in range(left, min(left + TILE, width)):
-            if pixels[v, u]:
-                mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
-    return mask
+    height, width = pixels.shape
+    for t in range(blocks.size):
+        mask, top, left = uint64(0), t // blocks.shape[1] * TILE, t % blocks.shape[1] * TILE
+        for v in range(top, min(top + TILE, height)):
+            for u in range(left, min(left + TILE, width)):
+                if pixels[v, u]:
+                    mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
+        blocks[t // blocks.shape[1], t % blocks.shape[1]] = mask
 
 
 @inline_kernel
@@ -169,8 +163,8 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
     pictures, out: rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H], flat, W = width and H
       rounded up to whole blocks; empty where not asked for.
     """
-    tiles, across, width, starts, stops, entries = lists
-    features, surfels, limits, wanted, shifts, background, back = given
+    tiles, across, _, starts, stops, entries = lists
+    features, surfels, limits, wanted, shifts, _, _ = given
     masks, closings, ends, states = kept
     _, _, stop, _, _, distortion_near = limits
     with_rgb, with_depth, with_median, with_normals, with_distortion, _ = flags
@@ -259,8 +253,7 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
         if len(pictures[1]):
-            _finish(state, left, top, width, wanted[slot], shift, first, entries, flat, row_size, surfels, limits,
-                    flags, background, back, slot, pictures)  # fmt: skip
+            _finish(state, left, top, slot, lists, given, flat, flags, pictures)
 
 
 @inline_kernel
@@ -301,15 +294,15 @@ def total_normal(state, back, slot, k, clear):
 
 
 @inline_kernel
-def _finish(
-    state, left, top, width, wanted, shift, first, entries, flat, row_size, surfels, limits, flags, background, back,
-    slot, pictures,
-):  # fmt: skip
+def _finish(state, left, top, slot, lists, given, flat, flags, pictures):
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
+    _, _, width, starts, _, entries = lists
+    features, surfels, limits, wanted, shifts, background, back = given
+    first, row_size, shift = starts[slot], int64(features.shape[1]), shifts[slot]
     rgb, alpha, expected, median, normals, distortion = pictures
     depths = np.empty(16, np.float32)
     numbers = depths.view(np.int32)
-    mask = wanted
+    mask = wanted[slot]
     while mask:
         b, mask = next_bit(mask)
         k = b * BLOCK_STATE
@@ -363,7 +356,7 @@ def depth_at(flat, o, u, v, surfels, limits):
 
 
 @exact_kernel
-def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
+def weigh_range(slots, lists, features, surfels, limits, wanted, labels, sums, peaks):
     """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count.
 
     `labels` [H, W] uint8: 0 where weights do not count, else 1 … K. Out: `sums` [K, P], zero on entry, of the weights
@@ -390,7 +383,7 @@ def weigh_range(slots, lists, features, surfels, limits, labels, sums, peaks):
                     label = int64(labels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x])
                     if 0 < label <= kinds:
                         state[k + COUNTED + 16 * (label - 1) + 4 * y + x] = ONE
-        alive = open_blocks(labels, left, top)
+        alive = wanted[slot]
         first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size

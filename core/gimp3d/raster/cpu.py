@@ -13,6 +13,7 @@ from ..camera import Camera
 from ..compute.jit import announce_compilation
 from ..compute.threads import parallel_map, run_ranges, thread_count
 from ..gaussians import ARRAYS, Gaussians
+from ..geometry import bounds
 from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
@@ -22,6 +23,7 @@ from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
 FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
+Flags = tuple[bool, ...]  # blend_range's
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
 NO_PICTURES = (np.empty(0, np.float32),) * 6
@@ -43,17 +45,13 @@ def project(
         features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
     out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
     grid = tile_grid(camera)
-    tiles = np.array([*((0, 0, *grid) if slots is None else _rectangle(slots >= 0)), *grid], np.int64)
+    wanted = np.ones(grid[::-1], bool) if slots is None else slots >= 0
+    (top, bottom), (left, right) = ((rows.start, rows.stop) for rows in bounds(wanted))
+    tiles = np.array([left, top, right, bottom, *grid], np.int64)
     limits = float(settings.near), float(low_pass), float(settings.alpha_min), bool(gaussians.antialiased)
     given = values_of(gaussians), pack_camera(camera), tiles, limits, with_colour
     run_ranges(project_range, n, *given, out.features, out.rects, out.states)
     return out
-
-
-def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """First column and row of what is set, and one past the last."""
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return (cols[0], rows[0], cols[-1] + 1, rows[-1] + 1) if len(rows) else (0, 0, 0, 0)
 
 
 def raw(values: np.ndarray) -> np.ndarray:
@@ -74,16 +72,16 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 def pack_camera(camera: Camera) -> np.ndarray:
     """What project_range reads of a camera, [22] float64; the Jacobian's bounds are gsplat's."""
     margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * camera.width, 0.5 * FRUSTUM_MARGIN * camera.height
-    bounds = [
+    slopes = [
         (-camera.cx - margin_x) / camera.fx,
         (camera.width - camera.cx + margin_x) / camera.fx,
         (-camera.cy - margin_y) / camera.fy,
         (camera.height - camera.cy + margin_y) / camera.fy,
     ]
-    return np.append(pack_pinhole(camera), bounds)
+    return np.append(pack_pinhole(camera), slopes)
 
 
-def pass_flags(passes: frozenset[str]) -> tuple[bool, ...]:
+def pass_flags(passes: frozenset[str]) -> Flags:
     """blend_range's flags; a ValueError if a pass is unknown."""
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
@@ -103,13 +101,6 @@ def padded_size(camera: Camera) -> tuple[int, int]:
     return -(-int(camera.height) // BLOCK) * BLOCK, -(-int(camera.width) // BLOCK) * BLOCK
 
 
-def empty_pictures(camera: Camera, flags: tuple[bool, ...]) -> tuple[np.ndarray, ...]:
-    """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
-    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
-    height, width = padded_size(camera)
-    return tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
-
-
 def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
     """A picture as kernels read it: flat, of whole blocks; empty if it has no pixels."""
     if not picture.size:
@@ -117,17 +108,6 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
     height, width = padded_size(camera)
     missing = ((0, height - camera.height), (0, width - camera.width), (0, 0))[: picture.ndim]
     return raw(np.pad(picture, missing) if missing[0][1] or missing[1][1] else picture).reshape(-1)
-
-
-def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
-    """The kernels' pictures without what pads them to whole blocks."""
-    cut = []
-    for flat, channels in zip(pictures, CHANNELS):
-        height, width = padded_size(camera) if len(flat) else (0, 0)
-        picture = flat.reshape(height, width, channels)[: camera.height, : camera.width]
-        cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
-    rgb, alpha, expected, median, normals, distortion = cut
-    return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
 
 
 def wanted_tiles(camera: Camera, pixels: Mask) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +146,7 @@ class Trace:
     view: Projected  # of them
     camera: Camera
     settings: RasterSettings
-    flags: tuple[bool, ...]
+    flags: Flags
     lists: TileLists
     features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
     wanted: np.ndarray  # [S] uint64
@@ -213,12 +193,7 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
 
 
 def prepare(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    flags: tuple[bool, ...],
-    pixels: Mask,
-    with_records: bool,
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, flags: Flags, pixels: Mask, with_records: bool
 ) -> Trace:
     """All that is done before blending."""
     slots, wanted = wanted_tiles(camera, pixels)
@@ -243,9 +218,16 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
         np.empty(slots, np.int64),
         np.empty((slots if keep else 0, TILE_STATE), np.float32),
     )
-    pictures = empty_pictures(traced.camera, traced.flags)
-    over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, traced.flags, front, pictures)
-    return as_rendering(pictures, traced.camera, traced.view.ignored), replace(traced, kept=kept)
+    (height, width), flags = padded_size(traced.camera), traced.flags
+    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
+    pictures = tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
+    over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, flags, front, pictures)
+    shapes = [(height, width, c) if w else (0, 0, c) for w, c in zip(wanted, CHANNELS)]
+    cut = [p.reshape(shape)[: traced.camera.height, : traced.camera.width] for p, shape in zip(pictures, shapes)]
+    cut = [np.ascontiguousarray(p if p.shape[2] == 3 else p[..., 0]) for p in cut]
+    rgb, alpha, expected, median, normals, distortion = cut
+    drawn = Rendering(rgb, alpha, expected, median, normals, distortion, traced.view.ignored)
+    return drawn, replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
@@ -277,15 +259,16 @@ def _weigh(
         raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
     counted = np.require(labels, np.uint8, ["C", "W"])
-    wanted = wanted_blocks(counted) > 0
+    blocks = wanted_blocks(counted)
+    wanted = blocks > 0
     if rows is not None:
         touched = np.zeros(wanted.shape, bool)
         mark_touched(view.rects, view.states, rows, touched)
         wanted &= touched
     lists = tile_lists(view, slots_of(wanted), with_records=False)
     sums, peaks = np.zeros((count, len(lists.entries)), np.float32), np.zeros(len(lists.entries), np.float32)
-    limits = pack_limits(settings)
-    over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)
+    given = view.features, gaussians.is_surfels, pack_limits(settings), blocks[wanted]
+    over_tiles(weigh_range, lists, camera, *given, counted, sums, peaks)
     total, peak = np.zeros((count, len(gaussians)), np.float32), np.zeros(len(gaussians), np.float32)
     gather_weights(lists.entries, sums, peaks, total, peak)
     return total, peak

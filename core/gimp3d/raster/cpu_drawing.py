@@ -61,7 +61,7 @@ class CpuDrawing:
         black = replace(self._made.settings, background=(0.0, 0.0, 0.0))
         return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb[..., 0])
 
-    def _draw(self, flags: tuple[bool, ...], **changed: Any) -> Rendering:
+    def _draw(self, flags: cpu.Flags, **changed: Any) -> Rendering:
         return cpu.blend(replace(self._made, flags=flags, **changed), keep=False)[0]
 
 

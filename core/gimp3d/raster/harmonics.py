@@ -41,9 +41,7 @@ def sh_basis(s, n, camera, bands, basis):
         for k in range(n):
             x, y, z = load3(basis, SH_X, k)
             xx, yy, zz = x * x, y * y, z * z
-            store1(basis, 4 * CHUNK + k, C2[0] * x * y)
-            store1(basis, 5 * CHUNK + k, -C2[0] * y * z)
-            store1(basis, 6 * CHUNK + k, C2[1] * (TWO * zz - xx - yy))
+            store3(basis, 4 * CHUNK, k, C2[0] * x * y, -C2[0] * y * z, C2[1] * (TWO * zz - xx - yy))
             store1(basis, 7 * CHUNK + k, -C2[0] * x * z)
             store1(basis, 8 * CHUNK + k, C2[2] * (xx - yy))
     if bands > 9:

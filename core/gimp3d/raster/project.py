@@ -100,15 +100,6 @@ def surfel_of(flat, o):
 
 
 @inline_kernel
-def _finite_bits(bits, i):
-    """Whether row i of float32 values, seen as int32 so that this vectorises, has no NaN or infinity."""
-    largest = int32(0)
-    for k in range(bits.shape[1]):
-        largest = max(largest, bits[i, k] & MAGNITUDE_BITS)
-    return largest < EXPONENT_BITS
-
-
-@inline_kernel
 def _usable(i, means, log_scales, quats, opacity_logits):
     """`Gaussians.usable` of one row, but for its SH coefficients."""
     ok = not math.isnan(opacity_logits[i])
@@ -164,9 +155,7 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         whiten_xx = math.sqrt(HALF_LOG2E * yy / det)
         store1(s, OUT_X + k, fx * tan_x + cx)
         store1(s, OUT_Y + k, fy * tan_y + cy)
-        store1(s, OUT_XX + k, whiten_xx)
-        store1(s, OUT_XY + k, -whiten_xx * uv / yy)
-        store1(s, OUT_YY + k, math.sqrt(HALF_LOG2E / yy))
+        store3(s, OUT_XX, k, whiten_xx, -whiten_xx * uv / yy, math.sqrt(HALF_LOG2E / yy))
         store1(s, OUT_HALF_WIDTH + k, radius * math.sqrt(xx))
         store1(s, OUT_HALF_HEIGHT + k, radius * math.sqrt(yy))
         store1(s, OUT_LOG2 + k, log2_opacity)
@@ -333,7 +322,10 @@ def _emit(s, n, rows, sh_bits, tiles, log2_alpha_min, surfels, flat, row_size, r
             continue
         if x1 <= tiles[0] or x0 >= tiles[2] or y1 <= tiles[1] or y0 >= tiles[3]:
             continue
-        if not _finite_bits(sh_bits, i):
+        largest = int32(0)
+        for j in range(sh_bits.shape[1]):
+            largest = max(largest, sh_bits[i, j] & MAGNITUDE_BITS)
+        if largest >= EXPONENT_BITS:  # NaN or infinity, seen as int32 so that this vectorises
             states[i] = UNUSABLE
             continue
         states[i] = DRAWN

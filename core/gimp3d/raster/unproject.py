@@ -24,7 +24,7 @@ from .unblend import RECORD
 D_RED, D_GREEN, D_BLUE, D_DEPTH, LOG_ALPHA = range(5)
 P_X, P_Y, P_XX, P_XY, P_YY = range(5, 10)
 D_U_X, D_U_Y, D_V_X, D_V_Y, D_A_X, D_A_Y, D_CENTRE_X, D_CENTRE_Y = range(5, 13)
-D_NORMAL_X, D_NORMAL_Y, D_NORMAL_Z = 13, 14, 15
+D_NORMAL_X = 13  # the first of three
 SIX, EIGHT = np.float32(6), np.float32(8)
 AHEAD = 16  # Gaussians whose records to prefetch: tiles left them all over the memory
 # Scratch planes after those of what is staged: a record's sums, then the gradients
@@ -231,12 +231,9 @@ def _surfels_back(s, n, camera):
         facing = -1.0 if plane > 0.0 else 1.0
         e00, e10, e20 = _to_world(r, gux * z / fx + d_along_u * x, guy * z / fy + d_along_u * y, d_along_u * z)
         e01, e11, e21 = _to_world(r, gvx * z / fx + d_along_v * x, gvy * z / fy + d_along_v * y, d_along_v * z)
-        e02, e12, e22 = _to_world(
-            r,
-            d_ax / fx + d_plane * x + facing * _sum(s, D_NORMAL_X, k),
-            d_ay / fy + d_plane * y + facing * _sum(s, D_NORMAL_Y, k),
-            d_plane * z + facing * _sum(s, D_NORMAL_Z, k),
-        )
+        sx, sy, sz = load3(s, STAGED + D_NORMAL_X * CHUNK, k)
+        sx, sy = d_ax / fx + d_plane * x + facing * sx, d_ay / fy + d_plane * y + facing * sy
+        e02, e12, e22 = _to_world(r, sx, sy, d_plane * z + facing * sz)
         _pull_rotation(s, k, e00, e01, e02, e10, e11, e12, e20, e21, e22)
 
 
