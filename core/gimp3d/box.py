@@ -27,19 +27,10 @@ class Box:
 
     @classmethod
     def make(cls, center: object, size: object, rotation_wxyz: object = (1, 0, 0, 0)) -> Box:
-        """A checked box from anything array-like.
+        """A checked box from anything array-like: three numbers each, in scene units, for its center and the length of
+        its edges, and a quaternion of any length but zero for how it is turned.
 
-        Parameters
-        ----------
-        center, size
-            Three numbers each, in scene units; the size is the length of the edges.
-        rotation_wxyz
-            A quaternion of any length but zero: how the box is turned.
-
-        Raises
-        ------
-        BadInput
-            If a number is missing, not finite, a size is not positive or the quaternion is zero.
+        If a number is missing or not finite, a size not positive or the quaternion zero, that is a BadInput.
 
         Examples
         --------
@@ -65,11 +56,8 @@ class Box:
         """[3, 3], columns are the box's axes in the scene."""
         return quats_to_matrices(self.rotation_wxyz[None])[0]
 
-    def contains(
-        self,
-        points: np.ndarray,  # [N, 3]
-    ) -> np.ndarray:
-        """[N] bool; points on a face are inside, NaN is outside."""
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """[N] bool of points [N, 3]; those on a face are inside, NaN is outside."""
         local = (points - self.center) @ self.axes
         return (np.abs(local) <= self.size / 2).all(-1)
 
@@ -85,28 +73,16 @@ class Box:
 Region = tuple[Box, ...]
 
 
-def in_region(
-    region: Sequence[Box],
-    points: np.ndarray,  # [N, 3]
-) -> np.ndarray:
-    """[N] bool: inside any of the boxes."""
-    inside = np.zeros(len(points), dtype=bool)
-    for box in region:
-        inside |= box.contains(points)
-    return inside
+def in_region(region: Sequence[Box], points: np.ndarray) -> np.ndarray:
+    """[N] bool: points [N, 3] inside any of the boxes."""
+    return np.any([np.zeros(len(points), bool), *(box.contains(points) for box in region)], axis=0)
 
 
-def box_from_matrix(
-    matrix: np.ndarray,  # [4, 4] unit-cube-to-scene transform without shear
-    bounds_min: np.ndarray,  # [3] of the shape in its own axes
-    bounds_max: np.ndarray,  # [3]
-) -> Box:
-    """The box that a transform makes of axis-aligned bounds; any rotation, scale (also negative), translation.
+def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.ndarray) -> Box:
+    """The box that a transform [4, 4] makes of bounds [3] along a shape's own axes: any rotation, scale (also
+    negative), translation.
 
-    Raises
-    ------
-    BadInput
-        If the transform shears (rotated child of a non-uniformly scaled parent) or flattens the box.
+    If it shears (rotated child of a non-uniformly scaled parent) or flattens the box, that is a BadInput.
     """
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
@@ -122,13 +98,7 @@ def box_from_matrix(
 
 
 def read_region(path: Path | str) -> Region:
-    """Read a ROI JSON: one box, or a list of boxes.
-
-    Raises
-    ------
-    BadInput
-        If the file is missing, is not JSON, or a box is malformed.
-    """
+    """Read a ROI JSON: one box, or a list of boxes. A missing or malformed file or box is a BadInput."""
     path = Path(path)
     data = read_json(path, "ROI", LARGEST_ROI)
     boxes = data if isinstance(data, list) else [data]

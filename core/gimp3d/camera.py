@@ -27,13 +27,8 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Camera:
-    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies.
-
-    Raises
-    ------
-    ValueError
-        If the picture has no pixels, or a number is not finite.
-    """
+    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies. A size that is negative
+    or a number that is not finite is a ValueError."""
 
     id: str  # file_path / image name / img_name, as the camera file gives it
     width: int  # pixels
@@ -77,30 +72,21 @@ class Camera:
         """Viewing direction in the world, [3]."""
         return self.R[2]
 
-    def to_camera(
-        self,
-        points: np.ndarray,  # [..., 3] world
-    ) -> np.ndarray:
-        """World points in camera axes, [..., 3]."""
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """World points [..., 3] in camera axes."""
         return points @ self.R.T + self.t
 
-    def project(
-        self,
-        points: np.ndarray,  # [..., 3] world
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates [..., 2] (continuous, centres at +0.5) and z-depth [...]; points with z ≤ 0 give NaN."""
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates [..., 2] (continuous, centres at +0.5) and z-depth [...] of world points [..., 3]; points
+        with z ≤ 0 give NaN."""
         p = self.to_camera(points)
         z = p[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(z > 0, 1.0 / z, np.nan)
         return np.stack([self.fx * p[..., 0] * inverse + self.cx, self.fy * p[..., 1] * inverse + self.cy], -1), z
 
-    def unproject(
-        self,
-        uv: np.ndarray,  # [..., 2] continuous pixel coordinates
-        depth: np.ndarray,  # [...] z-depth
-    ) -> np.ndarray:
-        """World points [..., 3] seen at `uv` at z-depth `depth`."""
+    def unproject(self, uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points [..., 3] seen at pixels `uv` [..., 2] at z-depth `depth` [...]."""
         x = (uv[..., 0] - self.cx) / self.fx * depth
         y = (uv[..., 1] - self.cy) / self.fy * depth
         return (np.stack([x, y, depth], -1) - self.t) @ self.R

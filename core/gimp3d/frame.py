@@ -70,14 +70,11 @@ class Frame:
 
     def proposed_back(self, proposed: dict[str, Any]) -> dict[str, Any]:
         """What a removal proposes to take along, see Growth.facts."""
-        return {**proposed, "box": self.box_back(proposed["box"])} if proposed else proposed
-
-    def box_back(self, box: dict[str, list[float]] | None) -> dict[str, list[float]] | None:
-        """A box as JSON, see Box.to_json."""
+        box = proposed.get("box")
         if box is None or self.is_files:
-            return box
+            return proposed
         center, size = np.array(box["center"]) / self.scale + self.origin, np.array(box["size"]) / self.scale
-        return Box.make(center, size, box["rotation_wxyz"]).to_json()
+        return {**proposed, "box": Box.make(center, size, box["rotation_wxyz"]).to_json()}
 
     def _moved(self, camera: Camera, translation: np.ndarray) -> Camera:
         if self.is_files:

@@ -78,20 +78,15 @@ class Gaussians:
         return replace(self, **{name: np.concatenate([getattr(g, name) for g in pair]) for name in ARRAYS})
 
 
-def pad_sh(
-    sh: np.ndarray,  # [N, K, 3]
-    bands: int,
-) -> np.ndarray:
-    """SH coefficients padded with zeros, or cut, to `bands` coefficients, [N, bands, 3]."""
+def pad_sh(sh: np.ndarray, bands: int) -> np.ndarray:
+    """SH coefficients [N, K, 3] padded with zeros, or cut, to `bands` coefficients, [N, bands, 3]."""
     if sh.shape[1] >= bands:
         return sh[:, :bands]
     return np.concatenate([sh, np.zeros((len(sh), bands - sh.shape[1], 3), sh.dtype)], axis=1)
 
 
-def quats_to_matrices(
-    quats: np.ndarray,  # [N, 4] wxyz, any norm > 0
-) -> np.ndarray:
-    """Rotation matrices [N, 3, 3] whose columns are the local axes."""
+def quats_to_matrices(quats: np.ndarray) -> np.ndarray:
+    """Rotation matrices [N, 3, 3] whose columns are the local axes, of quaternions [N, 4] wxyz of any norm > 0."""
     w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -101,10 +96,9 @@ def quats_to_matrices(
     return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
 
 
-def matrices_to_quats(
-    matrices: np.ndarray,  # [N, 3, 3] proper rotations
-) -> np.ndarray:
-    """Unit quaternions [N, 4] wxyz with w ≥ 0 (Bar-Itzhack 2000: the dominant eigenvector of a 4×4 matrix)."""
+def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
+    """Unit quaternions [N, 4] wxyz with w ≥ 0 of proper rotations [N, 3, 3] (Bar-Itzhack 2000: the dominant
+    eigenvector of a 4×4 matrix)."""
     m = np.asarray(matrices, dtype=np.float64)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(m, 0, -1)
     rows = [

@@ -24,11 +24,8 @@ EVIDENCE_DEPTH = 0.006  # relative z within which a photo shows a completed surf
 MOST_ROWS = 32_000  # of a picture that cv2.remap makes; it refuses 32,768
 
 
-def framed(
-    camera: Camera,
-    points: np.ndarray,  # [N, 3]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Which points lie in a view's frame: their indices [M], and the row, the column and the z at which they do."""
+def framed(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Which points [N, 3] lie in a view's frame: their indices [M], and row, column and z where they do."""
     uv, z = camera.project(points)
     with np.errstate(invalid="ignore"):
         inside = (z > 0) & (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
@@ -36,22 +33,14 @@ def framed(
     return np.flatnonzero(inside), rows, cols, z[inside]
 
 
-def same_surface(
-    drawn: np.ndarray,  # z of a first surface, 0 = nothing
-    z: np.ndarray,  # of the surface that is asked about, 0 = nothing
-    tolerance: float,  # relative
-) -> np.ndarray:
-    """Bool of the arrays' shape: both depths are of one surface."""
+def same_surface(drawn: np.ndarray, z: np.ndarray, tolerance: float) -> np.ndarray:
+    """Bool of the arrays' shape: a drawn depth and that of a surface asked about (0 = nothing) are within a relative
+    tolerance of the latter."""
     return (drawn > 0) & (z > 0) & (np.abs(drawn - z) < tolerance * z)
 
 
-def sees(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z of the first surface
-    points: np.ndarray,  # [N, 3]
-    tolerance: float,  # relative z
-) -> np.ndarray:
-    """[N] bool: the point is framed and is the surface seen there (z-test)."""
+def sees(camera: Camera, depth: np.ndarray, points: np.ndarray, tolerance: float) -> np.ndarray:
+    """[N] bool: the point is framed and is the surface seen there (z-test with a relative tolerance)."""
     index, rows, cols, z = framed(camera, points)
     result = np.zeros(len(points), bool)
     result[index] = same_surface(depth[rows, cols], z, tolerance)
@@ -59,12 +48,9 @@ def sees(
 
 
 def surface_points(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z
-    window: Window = WHOLE,  # only this part
-    step: int = 1,  # only every step-th row and column
+    camera: Camera, depth: np.ndarray, window: Window = WHOLE, step: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows [N], columns [N] and points [N, 3] of the pixels that show a surface."""
+    """Rows [N], columns [N] and points [N, 3] of a window's pixels, every step-th each way, that show a surface."""
     rows, cols = np.nonzero(depth[window][::step, ::step] > 0)
     rows, cols = step * rows + window[0].start, step * cols + window[1].start
     return rows, cols, camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), depth[rows, cols].astype(np.float64))
@@ -81,10 +67,7 @@ def disparity_of(depth: np.ndarray) -> np.ndarray:
     return np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
 
 
-def surface_normals(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z
-) -> np.ndarray:
+def surface_normals(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Unit normals [H, W, 3] of a depth map in camera axes, facing the camera; 0 where depth is missing."""
     points = camera.unproject(camera.pixel_centres(), depth.astype(np.float64)) @ camera.R.T
     normals = np.cross(_difference(points, 0), _difference(points, 1))
@@ -103,23 +86,16 @@ def _difference(points: np.ndarray, axis: int) -> np.ndarray:
     return np.where(np.abs(forward[..., 2:]) <= np.abs(backward[..., 2:]), forward, backward)
 
 
-def bounds(
-    mask: np.ndarray,  # [H, W] bool
-    margin: int = 0,  # pixels
-) -> Window:
-    """The rectangle that holds a mask and a margin, within the picture; an empty one where the mask is empty."""
+def bounds(mask: np.ndarray, margin: int = 0) -> Window:
+    """The rectangle that holds a mask and a margin in pixels, within the picture; an empty one for an empty mask."""
     found = [np.flatnonzero(mask.any(1 - axis)) for axis in (0, 1)]
     ends = [(max(0, int(x[0]) - margin), int(x[-1]) + margin + 1) if len(x) else (0, 0) for x in found]
     rows, cols = (slice(low, min(high, side)) for (low, high), side in zip(ends, mask.shape))
     return rows, cols
 
 
-def window_round(
-    points: np.ndarray,  # [N, 2] pixel coordinates
-    camera: Camera,
-    margin: int = 0,  # pixels
-) -> Window:
-    """The rectangle round the points and a margin, within the picture; never empty."""
+def window_round(points: np.ndarray, camera: Camera, margin: int = 0) -> Window:
+    """The rectangle round points [N, 2] in pixels and a margin, within the picture; never empty."""
     size = np.array([camera.width, camera.height])
     ends = [points.min(0), points.max(0)] if len(points) else [size / 2, size / 2]
     low = np.clip(np.floor(ends[0]) - margin, 0, size - 1).astype(int)
@@ -146,11 +122,8 @@ def dilated(mask: np.ndarray, margin: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
 
 
-def colours_at(
-    picture: np.ndarray,  # [H, W, C]
-    uv: np.ndarray,  # [N, 2] pixel coordinates; beyond the frame its border goes on
-) -> np.ndarray:
-    """[N, C] of the picture's type: bilinear samples."""
+def colours_at(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """[N, C] of the picture's type: bilinear samples at uv [N, 2]; beyond the frame its border goes on."""
     at = (uv.astype(np.float32) - np.float32(0.5))[:, None]
     parts = [at[k : k + MOST_ROWS] for k in range(0, len(at), MOST_ROWS)]
     found = [cv2.remap(picture, p, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0] for p in parts]

@@ -31,17 +31,8 @@ def orbit_cameras(
 ) -> tuple[Camera, ...]:
     """Cameras that look at a region's centre from rings above it, IDs orbit/000, orbit/001 …
 
-    Parameters
-    ----------
-    up
-        A direction in the scene, of any length; the rings stand round it.
-    width, height
-        Of the pictures, pixels.
-
-    Raises
-    ------
-    BadInput
-        If the up direction is zero, the region is empty, or a count, size or angle makes no sense.
+    The rings stand round `up`, a direction in the scene of any length; width and height are in pixels. A BadInput if it
+    is zero, the region is empty, or a count, size or angle makes no sense.
 
     Examples
     --------
@@ -121,12 +112,8 @@ def measured_up(scene: Gaussians, region: Sequence[Box]) -> np.ndarray | None:
     return np.round(normal * (1.0 if normal @ normals[best] > 0 else -1.0), 6)
 
 
-def look_at(
-    eye: np.ndarray,  # [3]
-    target: np.ndarray,  # [3]
-    up: np.ndarray,  # [3], not along the view
-) -> np.ndarray:
-    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`."""
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The world→camera matrix [4, 4] (OpenCV axes) of a camera at `eye` that looks at `target`, `up` not along it."""
     forward = _unit(target - eye)
     right = _unit(np.cross(forward, up))
     rotation = np.stack([right, np.cross(forward, right), forward])

@@ -8,6 +8,7 @@ must come to the same bits. Only what the kernels use is here.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from operator import add, mul, sub, truediv
 from typing import Any
 
@@ -15,6 +16,8 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from .jit import inline_kernel
 
 LANES = 16
 I16, I32, I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
@@ -28,11 +31,8 @@ ROUNDING = 1.5 * 2.0**23  # added to a float32 it leaves the nearest integer in 
 class Vec16Type(types.Type):
     """numba's type of a 16-lane vector."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Vec16")
 
-
-vec16 = Vec16Type()
+vec16 = Vec16Type(name="Vec16")
 f32 = types.float32
 
 
@@ -87,9 +87,12 @@ for _op, _instruction in ((add, "fadd"), (sub, "fsub"), (mul, "fmul"), (truediv,
     _define_operator(_op, _instruction)
 
 
-def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any, pointee: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index], inbounds=True), pointee.as_pointer())
+def _pointer(context: Any, builder: Any, sig: Any, args: Any, pointee: Any = None, row: int = 0) -> Any:
+    """Where array[index + row · stride] lies; args: the array, an index and, for rows after the first, a stride."""
+    place = builder.add(args[1], builder.mul(args[2], I64(row))) if row else args[1]
+    data = context.make_array(sig.args[0])(context, builder, args[0]).data
+    pointer = builder.gep(data, [place], inbounds=True)
+    return builder.bitcast(pointer, pointee.as_pointer()) if pointee else pointer
 
 
 @intrinsic
@@ -97,7 +100,7 @@ def load16(typing: Any, array: Any, index: Any) -> Any:
     """Lanes array[index : index + 16] of a flat float32 array."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = builder.load(_pointer(context, builder, sig.args[0], args[0], args[1], VECTOR))
+        value = builder.load(_pointer(context, builder, sig, args, VECTOR))
         value.align = 4
         return value
 
@@ -109,17 +112,10 @@ def store16(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index : index + 16] = value."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], VECTOR)
-        builder.store(args[2], pointer).align = 4
+        builder.store(args[2], _pointer(context, builder, sig, args, VECTOR)).align = 4
         return context.get_dummy_value()
 
     return types.void(array, types.int64, vec16), code
-
-
-def _row_pointer(context: Any, builder: Any, sig: Any, args: Any, row: int, kind: Any) -> Any:
-    """Where a block's row lies in an array; args: the array, an index and a stride."""
-    place = builder.add(args[1], builder.mul(args[2], I64(row)))
-    return _pointer(context, builder, sig.args[0], args[0], place, kind)
 
 
 @intrinsic
@@ -129,7 +125,7 @@ def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) ->
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         for row in range(4):
             four = _shuffle(builder, args[3], args[3], list(range(4 * row, 4 * row + 4)))
-            builder.store(four, _row_pointer(context, builder, sig, args, row, four.type)).align = 4
+            builder.store(four, _pointer(context, builder, sig, args, four.type, row)).align = 4
         return context.get_dummy_value()
 
     return types.void(array, types.int64, types.int64, vec16), code
@@ -145,7 +141,7 @@ def store_block3(typing: Any, array: Any, index: Any, stride: Any, x: Any, y: An
             pairs = _shuffle(builder, args[3], args[4], [v for k in lanes for v in (k, k + LANES)] + [0] * 8)
             chosen = [v for n, k in enumerate(lanes) for v in (2 * n, 2 * n + 1, k + LANES)]
             triples = _shuffle(builder, pairs, args[5], chosen)
-            builder.store(triples, _row_pointer(context, builder, sig, args, row, triples.type)).align = 4
+            builder.store(triples, _pointer(context, builder, sig, args, triples.type, row)).align = 4
         return context.get_dummy_value()
 
     return types.void(array, types.int64, types.int64, vec16, vec16, vec16), code
@@ -157,7 +153,7 @@ def _block_loader(channels: int, channel: int) -> Any:
             kind = ir.VectorType(ir.FloatType(), 4 * channels)
             rows = []
             for row in range(4):
-                loaded = builder.load(_row_pointer(context, builder, sig, args, row, kind))
+                loaded = builder.load(_pointer(context, builder, sig, args, kind, row))
                 loaded.align = 4
                 rows.append(_shuffle(builder, loaded, loaded, list(range(channel, 4 * channels, channels))))
             top, bottom = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
@@ -170,7 +166,13 @@ def _block_loader(channels: int, channel: int) -> Any:
 
 # A block's 4 rows from array[index + row · stride : …]: 4 values each, or one channel of 4 triples.
 load_block = _block_loader(1, 0)
-load_block_x, load_block_y, load_block_z = (_block_loader(3, c) for c in range(3))
+_load_x, _load_y, _load_z = (_block_loader(3, c) for c in range(3))
+
+
+@inline_kernel
+def load_block3(array, index, stride):
+    """A block's 4 rows of 4 triples from array[index + row · stride : … + 12], as store_block3 leaves them."""
+    return _load_x(array, index, stride), _load_y(array, index, stride), _load_z(array, index, stride)
 
 
 @intrinsic
@@ -178,8 +180,7 @@ def load1(typing: Any, array: Any, index: Any) -> Any:
     """array[index] without the wrap-around of negative indices, which would block vectorisation."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.load(builder.gep(data, [args[1]], inbounds=True))
+        return builder.load(_pointer(context, builder, sig, args))
 
     return array.dtype(array, types.int64), code
 
@@ -189,8 +190,7 @@ def store1(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """array[index] = value without the wrap-around of negative indices."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        builder.store(args[2], builder.gep(data, [args[1]], inbounds=True))
+        builder.store(args[2], _pointer(context, builder, sig, args))
         return context.get_dummy_value()
 
     return types.void(array, types.int64, array.dtype), code
@@ -208,102 +208,56 @@ def float_of(typing: Any, bits: Any) -> Any:
     return types.float64(types.int64), lambda context, builder, sig, args: builder.bitcast(args[0], ir.DoubleType())
 
 
-@intrinsic
-def splat16(typing: Any, scalar: Any) -> Any:
-    """The scalar in every lane."""
-    return vec16(f32), lambda context, builder, sig, args: _splat(builder, args[0])
-
-
-@intrinsic
-def ramp16(typing: Any) -> Any:
-    """0, 1, … 15."""
-    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k) for k in range(LANES)])
-
-
-@intrinsic
-def columns16(typing: Any) -> Any:
-    """Each lane's column in a block of 4×4 pixels."""
-    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k % 4) for k in range(LANES)])
-
-
-@intrinsic
-def rows16(typing: Any) -> Any:
-    """Each lane's row in a block of 4×4 pixels."""
-    return vec16(), lambda context, builder, sig, args: ir.Constant(VECTOR, [float(k // 4) for k in range(LANES)])
-
-
-@intrinsic
-def fma16(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """a · b + c, in one rounding where the machine can."""
+def _per_lane(count: int, build: Callable[..., Any]) -> Any:
+    """A function of `count` vectors, or scalars that go to every lane, to the vector that `build` makes of them."""
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _call(builder, "fmuladd", *_vectors(builder, sig, args))
+        return build(builder, *_vectors(builder, sig, args))
 
-    return vec16(a, b, c), code
-
-
-@intrinsic
-def exp2_16(typing: Any, x: Any) -> Any:
-    """2^x per lane for x ≤ 0; below −120 it is 2^−120."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        x = _larger(builder, args[0], _constant(-120.0))
-        shifted = builder.fadd(x, _constant(ROUNDING))
-        r = builder.fsub(x, builder.fsub(shifted, _constant(ROUNDING)))
-        p = _constant(EXP2[0])
-        for coefficient in EXP2[1:]:
-            p = _call(builder, "fmuladd", p, r, _constant(coefficient))
-        exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _integers(23))
-        return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
-
-    return vec16(vec16), code
+    typers: tuple[Callable[..., Any], ...] = (
+        lambda typing: (vec16(), code),
+        lambda typing, a: (vec16(a), code),
+        lambda typing, a, b: (vec16(a, b), code),
+        lambda typing, a, b, c: (vec16(a, b, c), code),
+        lambda typing, a, b, c, d: (vec16(a, b, c, d), code),
+    )
+    return intrinsic(typers[count])
 
 
-def _larger(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+def _lanes(number: Callable[[int], int]) -> Any:
+    return _per_lane(0, lambda builder: ir.Constant(VECTOR, [float(number(k)) for k in range(LANES)]))
 
 
-@intrinsic
-def max16(typing: Any, x: Any, y: Any) -> Any:
-    """The larger per lane; y where x is NaN."""
-    return vec16(x, y), lambda context, builder, sig, args: _larger(builder, *_vectors(builder, sig, args))
+def _selected(comparison: str) -> Callable[..., Any]:
+    """Per lane: yes where the comparison of x and y holds, which it never does for NaN, else no."""
+    return lambda builder, x, y, yes, no: builder.select(builder.fcmp_ordered(comparison, x, y), yes, no)
 
 
-@intrinsic
-def min16(typing: Any, x: Any, y: Any) -> Any:
-    """The smaller per lane; y where x is NaN."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        a, b = _vectors(builder, sig, args)
-        return builder.select(builder.fcmp_ordered("<", a, b), a, b)
-
-    return vec16(x, y), code
+def _larger(builder: Any, x: Any, y: Any) -> Any:
+    return _selected(">")(builder, x, y, x, y)
 
 
-@intrinsic
-def sqrt16(typing: Any, x: Any) -> Any:
-    return vec16(vec16), lambda context, builder, sig, args: _call(builder, "sqrt", args[0])
+def _exp2(builder: Any, x: Any) -> Any:
+    x = _larger(builder, x, _constant(-120.0))
+    shifted = builder.fadd(x, _constant(ROUNDING))
+    r = builder.fsub(x, builder.fsub(shifted, _constant(ROUNDING)))
+    p = _constant(EXP2[0])
+    for coefficient in EXP2[1:]:
+        p = _call(builder, "fmuladd", p, r, _constant(coefficient))
+    exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _integers(23))
+    return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
 
 
-@intrinsic
-def floor16(typing: Any, x: Any) -> Any:
-    return vec16(vec16), lambda context, builder, sig, args: _call(builder, "floor", args[0])
-
-
-def _where(comparison: str) -> Any:
-    def typer(typing: Any, x: Any, y: Any, yes: Any, no: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            a, b, then, other = _vectors(builder, sig, args)
-            return builder.select(builder.fcmp_ordered(comparison, a, b), then, other)
-
-        return vec16(x, y, yes, no), code
-
-    return typer
-
-
-# Per lane: yes where x > y (x == y), else no.
-where_greater = intrinsic(_where(">"))
-where_equal = intrinsic(_where("=="))
+ramp16 = _lanes(lambda k: k)  # 0, 1, … 15
+columns16, rows16 = _lanes(lambda k: k % 4), _lanes(lambda k: k // 4)  # each lane's in a block of 4×4 pixels
+splat16 = _per_lane(1, lambda builder, x: x)
+sqrt16 = _per_lane(1, lambda builder, x: _call(builder, "sqrt", x))
+floor16 = _per_lane(1, lambda builder, x: _call(builder, "floor", x))
+exp2_16 = _per_lane(1, _exp2)  # 2^x for x ≤ 0; below −120 it is 2^−120
+max16 = _per_lane(2, _larger)  # y where x is NaN, as with the smaller
+min16 = _per_lane(2, lambda builder, x, y: _selected("<")(builder, x, y, x, y))
+fma16 = _per_lane(3, lambda builder, *abc: _call(builder, "fmuladd", *abc))  # a · b + c, in one rounding if possible
+where_greater, where_equal = _per_lane(4, _selected(">")), _per_lane(4, _selected("=="))  # (x, y, yes, no)
 
 
 @intrinsic
@@ -343,7 +297,13 @@ def lowest_bit(typing: Any, bits: Any) -> Any:
     return types.int64(types.uint64), code
 
 
-def _reduction(combine: Any) -> Any:
+@inline_kernel
+def next_bit(mask):
+    """Index of the lowest set bit of a mask that is not 0, and the mask without it."""
+    return lowest_bit(mask), mask & (mask - types.uint64(1))
+
+
+def _reduction(combine: Callable[..., Any]) -> Any:
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value, lanes = args[0], LANES
         while lanes > 1:  # halves, so that the order of additions is fixed
@@ -352,19 +312,11 @@ def _reduction(combine: Any) -> Any:
             value = combine(builder, low, high)
         return builder.extract_element(value, I32(0))
 
-    return code
+    return intrinsic(lambda typing, x: (f32(vec16), code))
 
 
-@intrinsic
-def sum16(typing: Any, x: Any) -> Any:
-    """The sum of the lanes, always in the same order."""
-    return f32(vec16), _reduction(lambda builder, a, b: builder.fadd(a, b))
-
-
-@intrinsic
-def highest16(typing: Any, x: Any) -> Any:
-    """The largest lane."""
-    return f32(vec16), _reduction(_larger)
+# The sum of the lanes, always in the same order, and the largest lane
+sum16, highest16 = _reduction(lambda builder, low, high: builder.fadd(low, high)), _reduction(_larger)
 
 
 @intrinsic
@@ -393,7 +345,7 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
 
     def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         byte = ir.IntType(8).as_pointer()
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], ir.IntType(8))
+        pointer = _pointer(context, builder, sig, args, ir.IntType(8))
         kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         builder.call(function, [pointer, I32(0), I32(3), I32(1)])

@@ -64,12 +64,8 @@ def at_once(pixels: int) -> int | None:
     return 2 if pixels < SMALL else None
 
 
-def parallel_map(
-    function: Callable[[T], R],
-    items: Iterable[T],
-    most: int | None = None,  # at a time
-) -> list[R]:
-    """[function(x) for x in items], in order, on the pool; the first exception is raised."""
+def parallel_map(function: Callable[[T], R], items: Iterable[T], most: int | None = None) -> list[R]:
+    """[function(x) for x in items], in order, on the pool, `most` at a time; the first exception is raised."""
     items = list(items)
     if thread_count() == 1 or len(items) < 2:
         return [function(x) for x in items]

@@ -12,44 +12,11 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import Gaussians
-from .backend import Backend, Drawing, PixelRegion, Trace, current_backend, use_backend
-from .types import (
-    ALL_PASSES,
-    PASSES,
-    Contributions,
-    Gradients,
-    PictureGradients,
-    RasterSettings,
-    Rendering,
-    Window,
-)
-
-__all__ = [
-    "ALL_PASSES",
-    "PASSES",
-    "Backend",
-    "Contributions",
-    "Drawing",
-    "Gradients",
-    "PictureGradients",
-    "PixelRegion",
-    "RasterSettings",
-    "Rendering",
-    "Trace",
-    "Window",
-    "backward",
-    "contributions",
-    "drawing",
-    "footprint",
-    "label_weights",
-    "pixel_region",
-    "render",
-    "render_bytes",
-    "surface_depth",
-    "touched_window",
-    "trace",
-    "use_backend",
-]
+from .backend import Backend as Backend
+from .backend import Drawing, PixelRegion, Trace, current_backend
+from .backend import use_backend as use_backend
+from .types import ALL_PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
+from .types import PASSES as PASSES
 
 
 def render(
@@ -57,25 +24,15 @@ def render(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
-    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
+    pixels: Mask = None,
 ) -> Rendering:
     """Draw a scene (paper, equations 1 and 2).
 
-    Parameters
-    ----------
-    passes
-        Any of rgb, alpha, depth (both depths), expected_depth, normal and distortion; only these are computed.
-
-    Returns
-    -------
-    Rendering
-        rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene units (0: nothing),
-        normals [H, W, 3] in the camera's frame; all float32, None where not asked for.
-
-    Raises
-    ------
-    ValueError
-        If a pass is unknown, or the mask has not the picture's shape.
+    Of rgb, alpha, depth (both depths), expected_depth, normal and distortion only the passes asked for are computed,
+    other pictures are empty: rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene
+    units (0: nothing), normals [H, W, 3] in the camera's frame, all float32. Where `pixels` [H, W] bool are given, here
+    and below, only the 4×4 blocks round these are drawn, the rest is 0.
+    A pass that is unknown, or a mask that has not the picture's shape, is a ValueError.
 
     Examples
     --------
@@ -87,10 +44,7 @@ def render(
 
 
 def render_bytes(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: tuple[float, float, float] = (0, 0, 0),
-    pixels: np.ndarray | None = None,  # [H, W] bool, those that are wanted
+    gaussians: Gaussians, camera: Camera, background: tuple[float, float, float] = (0, 0, 0), pixels: Mask = None
 ) -> np.ndarray:
     """The scene as 8-bit RGB, [H, W, 3]."""
     rgb = render(gaussians, camera, RasterSettings(background=background), frozenset({"rgb"}), pixels).rgb
@@ -105,11 +59,6 @@ def trace(
 ) -> tuple[Rendering, Trace]:
     """As `render`, and what `backward` needs. The Gaussians' arrays must not change until then.
 
-    Raises
-    ------
-    ValueError
-        If a pass is unknown.
-
     Examples
     --------
     >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
@@ -123,15 +72,8 @@ def trace(
 def backward(traced: Trace, gradients: PictureGradients) -> Gradients:
     """The gradient of a loss with respect to the traced Gaussians, given that with respect to their pictures.
 
-    Returns
-    -------
-    Gradients
-        Of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32.
-
-    Raises
-    ------
-    ValueError
-        If a gradient has not its picture's shape, or the picture was not rendered.
+    It is that of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32. A given one that
+    has not its picture's shape, or whose picture was not rendered, is a ValueError.
 
     Examples
     --------
@@ -147,7 +89,7 @@ def backward(traced: Trace, gradients: PictureGradients) -> Gradients:
 def pixel_region(
     frozen: Gaussians,
     camera: Camera,
-    pixels: np.ndarray,  # [H, W] bool: the 4×4 blocks around them are drawn, the rest of the pictures is 0
+    pixels: np.ndarray,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = frozenset({"rgb", "alpha"}),
 ) -> PixelRegion:
@@ -155,12 +97,7 @@ def pixel_region(
 
     In every tile, what lies before the nearest and behind the farthest of the others is blended only when they leave
     the depths they were at. That is not done with the pass `depth` (the median needs every Gaussian); ask for
-    `expected_depth` alone where speed counts. A region is not for two threads at once.
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape, or a pass is unknown.
+    `expected_depth` alone where speed counts. A region is not for two threads at once. Errors are those of `render`.
 
     Examples
     --------
@@ -179,17 +116,12 @@ def drawing(
     camera: Camera,
     settings: RasterSettings = RasterSettings(),
     with_colour: bool = True,
-    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
+    pixels: Mask = None,
 ) -> Drawing:
     """A view that is to be drawn in more than one way: the Gaussians are projected and sorted once.
 
     Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
-    while a drawing is in use, and it is not for two threads at once.
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
+    while a drawing is in use, and it is not for two threads at once. A mask of the wrong shape is a ValueError.
 
     Examples
     --------
@@ -205,16 +137,13 @@ def drawing(
 def footprint(
     gaussians: Gaussians,
     camera: Camera,
-    chosen: np.ndarray,  # [N] bool
+    chosen: np.ndarray,
     settings: RasterSettings = RasterSettings(),
-    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
+    pixels: Mask = None,
 ) -> np.ndarray:
-    """Accumulated blend weight of the chosen Gaussians, [H, W] float32 in 0 … 1; others may hide them.
+    """Accumulated blend weight of the `chosen` Gaussians [N] bool, [H, W] float32 in 0 … 1; others may hide them.
 
-    Raises
-    ------
-    ValueError
-        If `chosen` or the mask has the wrong shape.
+    If `chosen` or the mask has the wrong shape, that is a ValueError.
 
     Examples
     --------
@@ -227,26 +156,13 @@ def footprint(
 
 
 def surface_depth(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings = RasterSettings(),
-    pixels: np.ndarray | None = None,  # [H, W] bool: the 4×4 blocks round these are drawn, the rest is 0
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings = RasterSettings(), pixels: Mask = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
-    splats (Yu 2024; Zhang 2024).
-
-    Returns
-    -------
-    depth : ndarray, [H, W] float32
-        Scene units; 0 where alpha < 0.5.
-    alpha : ndarray, [H, W] float32
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
+    splats (Yu 2024; Zhang 2024). Both are [H, W] float32; depth is in scene units, 0 where alpha < 0.5. A mask of the
+    wrong shape is a ValueError.
 
     Examples
     --------
@@ -258,22 +174,11 @@ def surface_depth(
 
 
 def contributions(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings = RasterSettings(),
-    pixels: np.ndarray | None = None,  # [H, W] bool: only these count
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings = RasterSettings(), pixels: Mask = None
 ) -> Contributions:
-    """Sum and maximum of every Gaussian's blend weights over the pixels of a view.
+    """Sum and maximum of every Gaussian's blend weights over a view's pixels, or only those given ([H, W] bool).
 
-    Returns
-    -------
-    Contributions
-        total [N] float32, the sum, and peak [N] float32, the maximum.
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
+    A mask of the wrong shape is a ValueError.
 
     Examples
     --------
@@ -286,22 +191,16 @@ def contributions(
 
 
 def label_weights(
-    gaussians: Gaussians,
-    camera: Camera,
-    labels: np.ndarray,  # [H, W] 0 where weights do not count, else 1 … count
-    count: int,
-    rows: np.ndarray | None = None,  # [N] bool: only these rows' weights are needed; others may come out too small
-    settings: RasterSettings = RasterSettings(),
+    gaussians: Gaussians, camera: Camera, labels: np.ndarray, count: int, rows: Mask = None
 ) -> np.ndarray:
-    """Sum of every Gaussian's blend weights over the pixels of each label, [count, N] float32."""
-    return current_backend().label_weights(gaussians, camera, settings, labels, count, rows)
+    """Sum of every Gaussian's blend weights over the pixels of each label, [count, N] float32.
+
+    `labels` [H, W] are 0 where weights do not count, else 1 … count. Where `rows` [N] bool are given, only theirs are
+    needed; others may come out too small.
+    """
+    return current_backend().label_weights(gaussians, camera, labels, count, rows)
 
 
-def touched_window(
-    gaussians: Gaussians,
-    camera: Camera,
-    margin: int = 0,  # pixels
-    settings: RasterSettings = RasterSettings(),
-) -> Window:
-    """A rectangle outside of which the Gaussians draw nothing, and a margin, within the picture; never empty."""
-    return current_backend().touched_window(gaussians, camera, margin, settings)
+def touched_window(gaussians: Gaussians, camera: Camera, margin: int = 0) -> Window:
+    """A rectangle outside of which the Gaussians draw nothing, and `margin` pixels, within the picture; never empty."""
+    return current_backend().touched_window(gaussians, camera, margin)

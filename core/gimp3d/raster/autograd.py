@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 
 from ..camera import Camera
-from ..gaussians import Gaussians
+from ..gaussians import ARRAYS, Gaussians
 from . import ALL_PASSES, PictureGradients, PixelRegion, RasterSettings, trace
-
-PICTURES = ("rgb", "alpha", "expected_depth", "median_depth", "normals", "distortion")
 
 
 @dataclass(frozen=True)
@@ -27,12 +25,15 @@ class Pictures:
     distortion: torch.Tensor | None  # [H, W]
 
 
+PICTURES = tuple(f.name for f in fields(Pictures))
+
+
 def rasterize(
-    means: torch.Tensor,  # [N, 3]
-    log_scales: torch.Tensor,  # [N, 3], or [N, 2] for surfels
-    quats: torch.Tensor,  # [N, 4] wxyz
-    opacity_logits: torch.Tensor,  # [N]
-    sh: torch.Tensor,  # [N, K, 3]
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quats: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
     view: Camera | PixelRegion,
     settings: RasterSettings = RasterSettings(),
     passes: frozenset[str] = ALL_PASSES,
@@ -40,21 +41,12 @@ def rasterize(
 ) -> Pictures:
     """Draw Gaussians so that a loss on the pictures flows back to them.
 
-    Parameters
-    ----------
-    means, log_scales, quats, opacity_logits, sh
-        Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
-        forward and backward: torch checks that.
-    view
-        A camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
-
-    Raises
-    ------
-    ValueError
-        If a tensor is of another type, on another device or not contiguous (it would have to be copied).
+    The first five are raw values as in `Gaussians`, contiguous float32 tensors on the CPU, or else a ValueError (they
+    would have to be copied). They must not be changed in place between forward and backward: torch checks that. `view`
+    is a camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
     """
     tensors = (means, log_scales, quats, opacity_logits, sh)
-    for name, t in zip(("means", "log_scales", "quats", "opacity_logits", "sh"), tensors):
+    for name, t in zip(ARRAYS, tensors):
         if t.dtype != torch.float32 or t.device.type != "cpu" or not t.is_contiguous():
             raise ValueError(f"{name}: expected a contiguous float32 tensor on the CPU, got {t.dtype} on {t.device}")
     drawn = _Rasterize.apply(*tensors, view, settings, passes, antialiased)
@@ -65,8 +57,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *args: Any) -> tuple[torch.Tensor, ...]:
         *tensors, view, settings, passes, antialiased = args
-        means, log_scales, quats, opacity_logits, sh = (t.detach().numpy() for t in tensors)
-        gaussians = Gaussians(means, log_scales, quats, opacity_logits, sh, antialiased)
+        gaussians = Gaussians(**{n: t.detach().numpy() for n, t in zip(ARRAYS, tensors)}, antialiased=antialiased)
         if isinstance(view, Camera):
             rendering, ctx.traced = trace(gaussians, view, settings, passes)
         else:
@@ -80,5 +71,4 @@ class _Rasterize(torch.autograd.Function):
         _ = ctx.saved_tensors
         gradients = {n: np.ascontiguousarray(g.numpy()) for n, g in zip(PICTURES, given) if g is not None and g.numel()}
         g = ctx.traced.backward(PictureGradients(**gradients))
-        out = (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh)
-        return (*(torch.from_numpy(v) for v in out), None, None, None, None)
+        return (*(torch.from_numpy(getattr(g, name)) for name in ARRAYS), None, None, None, None)

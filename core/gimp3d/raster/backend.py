@@ -11,7 +11,7 @@ from ..gaussians import Gaussians
 from . import cpu
 from .cpu_drawing import CpuDrawing
 from .region import CpuPixelRegion
-from .types import Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
+from .types import Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 
 
 class Trace(Protocol):
@@ -25,39 +25,29 @@ class PixelRegion(Protocol):
 
     def render(self, active: Gaussians) -> Rendering:
         """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
-        ...
 
     def trace(self, active: Gaussians) -> tuple[Rendering, Trace]:
         """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
-        ...
 
 
 class Drawing(Protocol):
     """A view of a scene, made ready once and drawn in several ways; see `drawing`."""
 
-    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+    def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
         """As `render`; of the drawing's own pixels only those given."""
-        ...
 
-    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
         """As `surface_depth`, without some Gaussians ([N] bool)."""
-        ...
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
         """As `footprint`; only for drawings without colours."""
-        ...
 
 
 class Backend(Protocol):
     """What a backend must do; the functions of this package say what each means. Arrays are NumPy's, in and out."""
 
     def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        passes: frozenset[str],
-        pixels: np.ndarray | None,
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], pixels: Mask
     ) -> Rendering: ...
 
     def trace(
@@ -65,38 +55,22 @@ class Backend(Protocol):
     ) -> tuple[Rendering, Trace]: ...
 
     def pixel_region(
-        self,
-        frozen: Gaussians,
-        camera: Camera,
-        pixels: np.ndarray,
-        settings: RasterSettings,
-        passes: frozenset[str],
+        self, frozen: Gaussians, camera: Camera, pixels: np.ndarray, settings: RasterSettings, passes: frozenset[str]
     ) -> PixelRegion: ...
 
     def drawing(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        with_colour: bool,
-        pixels: np.ndarray | None,
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
     ) -> Drawing: ...
 
     def contributions(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: Mask
     ) -> Contributions: ...
 
     def label_weights(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        labels: np.ndarray,
-        count: int,
-        rows: np.ndarray | None,
+        self, gaussians: Gaussians, camera: Camera, labels: np.ndarray, count: int, rows: Mask
     ) -> np.ndarray: ...
 
-    def touched_window(self, gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window: ...
+    def touched_window(self, gaussians: Gaussians, camera: Camera, margin: int) -> Window: ...
 
 
 class CpuBackend:
@@ -104,11 +78,7 @@ class CpuBackend:
 
     @staticmethod
     def render(
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        passes: frozenset[str],
-        pixels: np.ndarray | None,
+        gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str], pixels: Mask
     ) -> Rendering:
         return CpuDrawing(gaussians, camera, settings, "rgb" in passes, pixels).render(passes)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numba import float32, float64, int64, uint64
@@ -17,31 +18,17 @@ from ..compute.simd import (
     floor16,
     fma16,
     load1,
-    lowest_bit,
     max16,
     min16,
+    next_bit,
     prefetch,
     ramp16,
     spans_to_bits,
-    splat16,
     sqrt16,
     where_greater,
 )
 from ..compute.threads import parallel_map, run_ranges, thread_count
-from .project import (
-    BOUND_X,
-    BOUND_Y,
-    DEPTH,
-    DRAWN,
-    HALF,
-    HALF_HEIGHT,
-    HIDDEN,
-    TILE,
-    WHITEN_XX,
-    WHITEN_XY,
-    WHITEN_YY,
-    ZERO,
-)
+from .project import DEPTH, DRAWN, HALF, HALF_HEIGHT, HIDDEN, TILE, ZERO, Projected, ellipse_of
 
 AHEAD = 16  # rows to prefetch: in depth order each is a cache miss
 CELLS = 8  # a mask has a bit for each of 8×8 cells
@@ -64,76 +51,66 @@ class TileLists:
     spans: np.ndarray  # [N, 2] int64: a Gaussian's rows for sums are spans[g, 0] … spans[g, 1] − 1; or empty
 
 
-def tile_lists(
-    features: np.ndarray,  # [N, 16 or 32] float32
-    rects: np.ndarray,  # [N, 4] int16
-    states: np.ndarray,  # [N] int8
-    slots: np.ndarray,  # [down, across] int32: a tile's slot, −1 where it is not wanted
-    with_records: bool,
-) -> TileLists:
-    """Deal the drawn Gaussians into the wanted tiles; the states of those that reach none become HIDDEN."""
+def tile_lists(view: Projected, slots: np.ndarray, with_records: bool) -> TileLists:
+    """Deal the drawn Gaussians into the wanted tiles; the states of those that reach none become HIDDEN.
+
+    `slots` [down, across] int32: a tile's slot, −1 where it is not wanted.
+    """
+    features, rects, states = view.features, view.rects, view.states
     tiles = np.flatnonzero(slots.ravel() >= 0).astype(np.int32)
     if len(tiles) < slots.size:
         sums = np.zeros((slots.shape[0] + 1, slots.shape[1] + 1), np.int32)
         sums[1:, 1:] = (slots >= 0).cumsum(0).cumsum(1)
         run_ranges(_hide_range, len(states), rects, sums, states)
     order = depth_order(features, states)
-    bounds = _chunks(len(order))
-    chunks = range(len(bounds) - 1)
+    chunks = _chunks(len(order))
     places = np.zeros((len(chunks), len(tiles)), np.int64)
     ordered, masks = np.empty(len(order), np.int64), np.empty(len(order), np.uint64)
     spans = np.zeros((len(states) if with_records else 0, 2), np.int64)
     packed = rects.view(np.int64).ravel()
 
-    def deal(k: int, entries: np.ndarray, record: int, records: np.ndarray) -> int:
-        part = bounds[k], bounds[k + 1], order, features, packed, ordered, masks, slots, places[k]
-        return _deal(*part, entries, record, records, spans)
+    def deal(entries: np.ndarray, records: np.ndarray, first: list[int]) -> list[int]:
+        def work(k: int) -> int:
+            given = order, features, packed, ordered, masks, slots, places[k], entries, first[k], records, spans
+            return _deal(*chunks[k], *given)
 
-    none, no_records = np.empty(0, np.int32), np.empty(0, np.int64)
-    counts = parallel_map(lambda k: deal(k, none, 0, no_records), chunks)
+        return parallel_map(work, range(len(chunks)))
+
+    counts = deal(np.empty(0, np.int32), np.empty(0, np.int64), [0] * len(chunks))
     ends = np.cumsum(places.T).reshape(places.T.shape)  # tile by tile, and in a tile chunk by chunk
     places = np.ascontiguousarray(ends.T) - places
     starts = np.zeros(len(tiles) + 1, np.int64)
     starts[1:] = ends[:, -1]
     entries, records = np.empty(starts[-1], np.int32), np.empty(starts[-1] if with_records else 0, np.int64)
     if starts[-1]:
-        first = np.cumsum([0, *counts])
-        parallel_map(lambda k: deal(k, entries, first[k], records), chunks)
+        deal(entries, records, list(accumulate(counts, initial=0)))
     return TileLists(tiles, starts[:-1], starts[1:], entries, records, spans)
 
 
-def _chunks(count: int) -> list[int]:
+def _chunks(count: int) -> list[tuple[int, int]]:
     chunks = max(1, min(thread_count(), count // ROWS_PER_CHUNK))
-    return [count * k // chunks for k in range(chunks + 1)]
+    return [(count * k // chunks, count * (k + 1) // chunks) for k in range(chunks)]
 
 
-def depth_order(
-    features: np.ndarray,  # [N, 16 or 32] float32
-    states: np.ndarray,  # [N] int8
-) -> np.ndarray:
+def depth_order(features: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Drawn rows from near to far, rows of equal depth in file order, [D] int32.
 
     A least-significant-digit radix sort of the float32 depths, whose bits sort like their values (they are positive);
     digits cover only the bits in which the depths differ.
     """
-    bounds = _chunks(len(states))
-    chunks = range(len(bounds) - 1)
-    drawn = [_count_drawn(states, bounds[k], bounds[k + 1]) for k in chunks]
-    starts = np.concatenate([[0], np.cumsum(drawn)])
-    total = int(starts[-1])
+    chunks = _chunks(len(states))
+    *starts, total = accumulate((int(np.count_nonzero(states[lo:hi] == DRAWN)) for lo, hi in chunks), initial=0)
     rows, keys = np.empty((2, total), np.int32), np.empty((2, total), np.int32)
-    parallel_map(
-        lambda k: _gather_keys(bounds[k], bounds[k + 1], features.view(np.int32), states, starts[k], rows[0], keys[0]),
-        chunks,
-    )
+    bits = features.view(np.int32)
+    parallel_map(lambda part: _gather_keys(*part[0], bits, states, part[1], rows[0], keys[0]), zip(chunks, starts))
     if not total:
         return rows[0]
     lowest = int(keys[0].min())
-    bits = (int(keys[0].max()) - lowest).bit_length()
-    passes = -(-bits // MOST_DIGIT_BITS)
+    length = (int(keys[0].max()) - lowest).bit_length()
+    passes = -(-length // MOST_DIGIT_BITS)
     for p in range(passes):
-        a, b = p % 2, 1 - p % 2
-        _sort_by_digit(keys[a], rows[a], lowest, p * -(-bits // passes), -(-bits // passes), keys[b], rows[b])
+        a, b, width = p % 2, 1 - p % 2, -(-length // passes)
+        _sort_by_digit(keys[a], rows[a], lowest, p * width, width, keys[b], rows[b])
     return rows[passes % 2]
 
 
@@ -141,24 +118,13 @@ def _sort_by_digit(
     keys: np.ndarray, rows: np.ndarray, lowest: int, shift: int, width: int, keys_out: np.ndarray, rows_out: np.ndarray
 ) -> None:
     """A stable counting sort by `width` bits of the keys, each chunk of them on its own thread."""
-    bounds = _chunks(len(keys))
-    chunks = range(len(bounds) - 1)
+    chunks = _chunks(len(keys))
     counts = np.zeros((len(chunks), 1 << width), np.int32)
-    parallel_map(lambda k: _count_digits(bounds[k], bounds[k + 1], keys, lowest, shift, counts[k]), chunks)
+    parallel_map(lambda part: _count_digits(*part[0], keys, lowest, shift, part[1]), zip(chunks, counts))
     ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
     places = np.ascontiguousarray(ends.T) - counts
-    parallel_map(
-        lambda k: _scatter_digits(bounds[k], bounds[k + 1], keys, rows, lowest, shift, places[k], keys_out, rows_out),
-        chunks,
-    )
-
-
-@exact_kernel
-def _count_drawn(states, lo, hi):
-    count = 0
-    for i in range(lo, hi):
-        count += states[i] == DRAWN
-    return count
+    out = keys_out, rows_out
+    parallel_map(lambda part: _scatter_digits(*part[0], keys, rows, lowest, shift, part[1], *out), zip(chunks, places))
 
 
 @exact_kernel
@@ -194,20 +160,20 @@ def cover_mask(flat, o, left, top, cell):
 
     Bit 8 r + c stands for column c of row r. Lane r of the vectors is row r. Rounding may add a cell, never lose one.
     """
-    half_height, xx = load1(flat, o + HALF_HEIGHT), load1(flat, o + WHITEN_XX)
-    xy, yy = load1(flat, o + WHITEN_XY), load1(flat, o + WHITEN_YY)
+    x, y, xx, xy, yy = ellipse_of(flat, o)
+    half_height = load1(flat, o + HALF_HEIGHT)
     radius, inverse = half_height * yy, ONE / xx
-    first_centre = fma16(ramp16(), cell, top + HALF - load1(flat, o + BOUND_Y))
+    first_centre = fma16(ramp16(), cell, top + HALF - y)
     low = max16(first_centre, -half_height)
     high = min16(first_centre + (cell - ONE), half_height)
     # the bound reaches furthest right at dy = tip and furthest left at dy = −tip
     slope = float64(xy) / float64(yy)
     tip = float32(-slope * float64(radius) / (float64(yy) * math.sqrt(1.0 + slope * slope)))
-    right, left_dy = min16(max16(splat16(tip), low), high), min16(max16(splat16(-tip), low), high)
+    right, left_dy = min16(max16(tip, low), high), min16(max16(-tip, low), high)
     down_right, down_left = right * yy, left_dy * yy
     reach_right = sqrt16(max16(radius * radius - down_right * down_right, ZERO)) - right * xy + SLACK * radius
     reach_left = sqrt16(max16(radius * radius - down_left * down_left, ZERO)) + left_dy * xy + SLACK * radius
-    middle, per_cell = load1(flat, o + BOUND_X) - left, ONE / cell
+    middle, per_cell = x - left, ONE / cell
     # pixel centres lie at +½: the first pixel right of v is −⌊½ − v⌋, the last one left of it ⌊v − ½⌋
     first_pixel = ZERO - floor16(HALF + SLACK_PX - (middle - reach_left * inverse))
     last_pixel = floor16(middle + reach_right * inverse - (HALF - SLACK_PX))
@@ -268,12 +234,10 @@ def _deal(lo, hi, order, features, rects, ordered, masks, slots, places, entries
         x0, y0, x1, y1 = rect & 0xFFFF, (rect >> 16) & 0xFFFF, (rect >> 32) & 0xFFFF, (rect >> 48) & 0xFFFF
         first = record
         # of one row or column of tiles the bound reaches every one
-        if x1 - x0 == 1:
+        if x1 - x0 == 1 or y1 - y0 == 1:
             for v in range(y0, y1):
-                record = _put(slots[v, x0], g, record, counting, recording, places, entries, records)
-        elif y1 - y0 == 1:
-            for u in range(x0, x1):
-                record = _put(slots[y0, u], g, record, counting, recording, places, entries, records)
+                for u in range(x0, x1):
+                    record = _put(slots[v, u], g, record, counting, recording, places, entries, records)
         else:
             small = x1 - x0 <= CELLS and y1 - y0 <= CELLS  # one mask holds all
             for top in range(y0, y1, CELLS):
@@ -286,8 +250,7 @@ def _deal(lo, hi, order, features, rects, ordered, masks, slots, places, entries
                         mask &= cover_mask(flat, int64(g) * width, float32(left * TILE), float32(top * TILE), CELL)
                         masks[k] = mask
                     while mask:
-                        bit = lowest_bit(mask)
-                        mask &= mask - uint64(1)
+                        bit, mask = next_bit(mask)
                         slot = slots[top + (bit >> 3), left + (bit & 7)]
                         record = _put(slot, g, record, counting, recording, places, entries, records)
         if recording and not counting:

@@ -19,9 +19,9 @@ from ..compute.simd import (
     highest16,
     load1,
     load16,
-    lowest_bit,
     max16,
     min16,
+    next_bit,
     prefetch,
     rows16,
     splat16,
@@ -62,18 +62,20 @@ def aligned_empty(size):
 
 
 @inline_kernel
-def ellipse_alpha(along, down, log2_opacity, alpha_min, alpha_max):
-    """(alpha before it is capped, alpha) of a 3D Gaussian at whitened offsets."""
+def ellipse_alpha(along, down, log2_opacity, limits):
+    """(alpha before it is capped, alpha) of a 3D Gaussian at whitened offsets; limits as blend_range's."""
     free = exp2_16(log2_opacity - fma16(along, along, down * down))
-    return free, where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
+    return free, where_greater(free, limits[0], min16(free, limits[1]), ZERO)
 
 
 @inline_kernel
-def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max):
-    """(alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass decides as 1 or 0) of a surfel.
-
-    u, v and den are U·δ, V·δ and 1 + A·δ (Huang 2024, eq. 8–11).
-    """
+def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
+    """U·δ, V·δ, 1 + A·δ (Huang 2024, eq. 8–11), alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass
+    decides as 1 or 0, of surfel_of a row, at offsets δ = (dx, dy)."""
+    _, _, u_x, u_y, v_x, v_y, a_x, a_y = surfel
+    alpha_min, alpha_max, _, near, disc, _ = limits
+    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
+    den = fma16(dx, a_x, fma16(dy, a_y, splat16(ONE)))
     inverse = where_greater(den, HORIZON, ONE / den, ZERO)  # no hit behind the camera
     near_plane = depth / near  # den beyond which the surfel lies before the near plane
     squared = fma16(u, u, v * v) * inverse * inverse
@@ -81,25 +83,20 @@ def surfel_alpha(u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, 
     low_pass = fma16(dx, dx, dy * dy) * disc
     free = exp2_16(log2_opacity - min16(low_pass, squared))
     alpha = where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
-    return free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
+    return u, v, den, free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
 
 
 @exact_kernel
-def region_blocks(pixels, across, blocks):
-    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [T] uint64 out."""
-    for t in range(len(blocks)):
-        blocks[t] = open_blocks(pixels, t % across * TILE, t // across * TILE, pixels.shape[1], pixels.shape[0])
-
-
-@inline_kernel
-def open_blocks(pixels, left, top, width, height):
-    """A mask of the tile's blocks that have a wanted pixel."""
-    mask = uint64(0)
-    for v in range(top, min(top + TILE, height)):
-        for u in range(left, min(left + TILE, width)):
-            if pixels[v, u]:
-                mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
-    return mask
+def region_blocks(pixels, blocks):
+    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [down, across] uint64 out."""
+    height, width = pixels.shape
+    for t in range(blocks.size):
+        mask, top, left = uint64(0), t // blocks.shape[1] * TILE, t % blocks.shape[1] * TILE
+        for v in range(top, min(top + TILE, height)):
+            for u in range(left, min(left + TILE, width)):
+                if pixels[v, u]:
+                    mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
+        blocks[t // blocks.shape[1], t % blocks.shape[1]] = mask
 
 
 @inline_kernel
@@ -117,9 +114,8 @@ def _close(state, size, mask, entry, stop):
     those in which some were closed."""
     still, closing = uint64(0), uint64(0)
     while mask:
-        b = lowest_bit(mask)
-        bit = mask & (~mask + uint64(1))
-        mask ^= bit
+        b, mask = next_bit(mask)
+        bit = uint64(1) << uint64(b)
         k = b * size
         t = load16(state, k + T)
         if any_between(t, ZERO, stop):
@@ -142,9 +138,8 @@ def _open(state, mask, stop):
     _, _ = _close(state, BLOCK_STATE, mask, ZERO, stop)
     still = uint64(0)
     while mask:
-        b = lowest_bit(mask)
-        bit = mask & (~mask + uint64(1))
-        mask ^= bit
+        b, mask = next_bit(mask)
+        bit = uint64(1) << uint64(b)
         store16(state, b * BLOCK_STATE + CLOSED, splat16(ZERO))
         if highest16(load16(state, b * BLOCK_STATE + T)) > ZERO:
             still |= bit
@@ -152,42 +147,31 @@ def _open(state, mask, stop):
 
 
 @exact_kernel
-def blend_range(
-    lo,
-    hi,
-    order,  # [S] slots in the order in which they are done
-    tiles,  # [S]
-    across,
-    width,  # of the pictures
-    starts,  # [S] first entry of each slot
-    stops,  # [S] one past the last
-    entries,  # [P]
-    features,  # [N, 16 or 32]
-    surfels,  # features are of surfels
-    limits,  # [6] float32: alpha_min, alpha_max, stop, near, low-pass factor of surfels, distortion's near
-    shifts,  # [S] float32 > 0: depths (and their disparities) are summed less this one, against cancellation
-    flags,  # [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
-    # 1 + its Gaussian's row as int32 bits
-    wanted,  # [S] uint64: blocks to draw
-    front,  # [S, TILE_STATE] what lies before the entries, or empty
-    masks,  # [P] uint64 out: blocks that each entry was blended into, or empty
-    closings,  # [P/CHECK + S + 1] uint64 out: blocks with closing pixels at each check, or empty
-    ends,  # [S] int64 out: one past the last entry that was looked at
-    states,  # [S, TILE_STATE] out; [0, …] if the caller needs only the pictures
-    background,  # [3]
-    back,  # [S, TILE_STATE] what lies behind the entries, or empty
-    pictures,  # (rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H]) out: flat, W = width
-    # and H rounded up to whole blocks; empty where not asked for, and if alpha is empty, only the states are made
-):
-    """Blend the tiles of slots order[lo:hi]."""
-    alpha_min, alpha_max, stop = limits[0], limits[1], limits[2]
-    near, disc, distortion_near = limits[3], limits[4], limits[5]
-    with_rgb, with_depth, with_median, with_normals, with_distortion = flags[0], flags[1], flags[2], flags[3], flags[4]
+def blend_range(slots, lists, given, kept, flags, front, pictures):
+    """Blend the tiles of some slots into pictures, or, if the alpha of these is empty, only make the states.
+
+    lists: tiles [S], how many across, the pictures' width, starts [S], stops [S], entries [P].
+    given: features [N, 16 or 32]; whether of surfels; limits (alpha_min, alpha_max, stop, near, surfels' low-pass
+      factor, distortion_near); blocks to draw, wanted [S] uint64; shifts [S] float32 > 0: depths (and disparities) are
+      summed less this one, against cancellation; background [3]; what lies behind, back [S, TILE_STATE], or empty.
+    kept, out, where not empty: the blocks that each entry was blended into, masks [P] uint64; those with closing pixels
+      at each check, closings [P/CHECK + S + 1] uint64; one past the last entry that was looked at, ends [S] int64
+      (never empty); states [S, TILE_STATE].
+    flags [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
+      1 + its Gaussian's row as int32 bits.
+    front [S, TILE_STATE]: what lies before the entries, or empty.
+    pictures, out: rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H], flat, W = width and H
+      rounded up to whole blocks; empty where not asked for.
+    """
+    tiles, across, _, starts, stops, entries = lists
+    features, surfels, limits, wanted, shifts, _, _ = given
+    masks, closings, ends, states = kept
+    _, _, stop, _, _, distortion_near = limits
+    with_rgb, with_depth, with_median, with_normals, with_distortion, _ = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     own_state, covers = aligned_empty(TILE_STATE), np.empty(CHECK, np.uint64)
-    for j in range(lo, hi):
-        slot = order[j]
+    for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state = states[slot] if len(states) else own_state
         if len(front):
@@ -213,19 +197,14 @@ def blend_range(
             number = splat16(float32(i - first + 1))
             log2_opacity, depth, red, green, blue, nx, ny, nz = shown_of(flat, o)
             if surfels:
-                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
-                x, y = float32(left) + HALF - x, float32(top) + HALF - y
+                surfel = surfel_of(flat, o)
+                x, y = float32(left) + HALF - surfel[0], float32(top) + HALF - surfel[1]
                 disparity = distortion_near / depth
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    _, alpha, inverse, blurred = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    _, _, den, _, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     before = load16(state, k + T)
                     weight = alpha * before
                     after = before - weight
@@ -248,13 +227,11 @@ def blend_range(
                 along0, down0 = fma16(column, xx, row * xy), row * yy
                 m = splat16(distortion_near / depth - disparity_shift)
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
-                    _, alpha = ellipse_alpha(
-                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
-                    )
+                    along, down = along0 + (dx * xx + dy * xy), down0 + dy * yy
+                    _, alpha = ellipse_alpha(along, down, log2_opacity, limits)
                     before = load16(state, k + T)
                     weight = alpha * before
                     after = before - weight
@@ -276,8 +253,7 @@ def blend_range(
                     closings[(first // CHECK) + slot + (i - first) // CHECK] = closing
         ends[slot] = i
         if len(pictures[1]):
-            _finish(state, left, top, width, wanted[slot], shift, first, entries, flat, row_size, surfels, limits,
-                    flags, background, back, slot, pictures)  # fmt: skip
+            _finish(state, left, top, slot, lists, given, flat, flags, pictures)
 
 
 @inline_kernel
@@ -318,18 +294,17 @@ def total_normal(state, back, slot, k, clear):
 
 
 @inline_kernel
-def _finish(
-    state, left, top, width, wanted, shift, first, entries, flat, row_size, surfels, limits, flags, background, back,
-    slot, pictures,
-):  # fmt: skip
+def _finish(state, left, top, slot, lists, given, flat, flags, pictures):
     """Write the tile's blocks into the pictures; blocks that are not wanted are left alone."""
+    _, _, width, starts, _, entries = lists
+    features, surfels, limits, wanted, shifts, background, back = given
+    first, row_size, shift = starts[slot], int64(features.shape[1]), shifts[slot]
     rgb, alpha, expected, median, normals, distortion = pictures
     depths = np.empty(16, np.float32)
     numbers = depths.view(np.int32)
-    mask = wanted
+    mask = wanted[slot]
     while mask:
-        b = lowest_bit(mask)
-        mask &= mask - uint64(1)
+        b, mask = next_bit(mask)
         k = b * BLOCK_STATE
         u, v = left + BLOCK * (b & 7), top + BLOCK * (b >> 3)
         o = v * width + u
@@ -381,25 +356,14 @@ def depth_at(flat, o, u, v, surfels, limits):
 
 
 @exact_kernel
-def weigh_range(
-    lo,
-    hi,
-    order,
-    tiles,
-    across,
-    _width,
-    starts,
-    stops,
-    entries,
-    features,
-    surfels,
-    limits,
-    labels,  # [H, W] uint8: 0 where weights do not count, else 1 … K
-    sums,  # [K, P] out: Σ of the blend weights of each list entry over the pixels of a label; zero on entry
-    peaks,  # [P] out: their maximum over all labels
-):
-    """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count."""
-    alpha_min, alpha_max, stop, near, disc = limits[0], limits[1], limits[2], limits[3], limits[4]
+def weigh_range(slots, lists, features, surfels, limits, wanted, labels, sums, peaks):
+    """Blend weights per (tile, Gaussian), each in its own place: no atomics, the same for any thread count.
+
+    `labels` [H, W] uint8: 0 where weights do not count, else 1 … K. Out: `sums` [K, P], zero on entry, of the weights
+    of each list entry over the pixels of a label, and `peaks` [P], their maximum. The others as for blend_range.
+    """
+    tiles, across, _, starts, stops, entries = lists
+    stop = limits[2]
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     height, width = labels.shape
@@ -407,8 +371,7 @@ def weigh_range(
     size = COUNTED + 16 * kinds
     state, covers = aligned_empty(BLOCKS * size), np.empty(CHECK, np.uint64)
     weight_sums = aligned_empty(16 * kinds)
-    for j in range(lo, hi):
-        slot = order[j]
+    for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         for b in range(BLOCKS):
             k = b * size
@@ -420,7 +383,7 @@ def weigh_range(
                     label = int64(labels[top + BLOCK * (b >> 3) + y, left + BLOCK * (b & 7) + x])
                     if 0 < label <= kinds:
                         state[k + COUNTED + 16 * (label - 1) + 4 * y + x] = ONE
-        alive = open_blocks(labels, left, top, width, height)
+        alive = wanted[slot]
         first, end, i = starts[slot], stops[slot], starts[slot]
         while i < end and alive:
             o = int64(entries[i]) * row_size
@@ -432,26 +395,19 @@ def weigh_range(
             for label in range(kinds):
                 store16(weight_sums, 16 * label, none)
             while mask:
-                b = lowest_bit(mask)
-                mask &= mask - uint64(1)
+                b, mask = next_bit(mask)
                 k = b * size
-                x, y = (
-                    float32(left) + HALF + BLOCK_PX * float32(b & 7),
-                    float32(top) + HALF + BLOCK_PX * float32(b >> 3),
-                )
+                x = float32(left) + HALF + BLOCK_PX * float32(b & 7)
+                y = float32(top) + HALF + BLOCK_PX * float32(b >> 3)
                 if surfels:
-                    centre_x, centre_y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
-                    dx, dy = column + (x - centre_x), row + (y - centre_y)
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    _, alpha, _, _ = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    surfel = surfel_of(flat, o)
+                    dx, dy = column + (x - surfel[0]), row + (y - surfel[1])
+                    _, _, _, _, alpha, _, _ = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                 else:
                     centre_x, centre_y, xx, xy, yy = ellipse_of(flat, o)
                     dx, dy = column + (x - centre_x), row + (y - centre_y)
                     along = fma16(dx, xx, dy * xy)
-                    _, alpha = ellipse_alpha(along, dy * yy, log2_opacity, alpha_min, alpha_max)
+                    _, alpha = ellipse_alpha(along, dy * yy, log2_opacity, limits)
                 before = load16(state, k + T)
                 weight = alpha * before
                 store16(state, k + T, before - weight)

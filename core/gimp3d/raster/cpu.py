@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,41 +12,22 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import announce_compilation
 from ..compute.threads import parallel_map, run_ranges, thread_count
-from ..gaussians import Gaussians
+from ..gaussians import ARRAYS, Gaussians
+from ..geometry import bounds
+from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
-from .project import (
-    DEPTH,
-    DRAWN,
-    ELLIPSE_ROW,
-    HALF_LOG2E,
-    SURFEL_ROW,
-    TILE,
-    UNUSABLE,
-    project_range,
-)
-from .types import PASSES, Contributions, Gradients, PictureGradients, RasterSettings, Rendering, Window
+from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, Projected, project_range
+from .types import PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
 FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the half frustum (Kerbl 2023, gsplat)
+Flags = tuple[bool, ...]  # blend_range's
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
+NO_PICTURES = (np.empty(0, np.float32),) * 6
 CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
-NO_PICTURES = (np.empty(0, np.float32),) * len(CHANNELS)
-
-
-@dataclass(frozen=True)
-class Projected:
-    """Gaussians projected into a camera."""
-
-    features: np.ndarray  # [N, 16 or 32] float32
-    rects: np.ndarray  # [N, 4] int16
-    states: np.ndarray  # [N] int8
-
-    @property
-    def ignored(self) -> int:
-        return int(np.count_nonzero(self.states == UNUSABLE))
 
 
 def project(
@@ -53,41 +35,23 @@ def project(
     camera: Camera,
     settings: RasterSettings,
     with_colour: bool,
-    out: Projected | None = None,
     slots: np.ndarray | None = None,
+    features: np.ndarray | None = None,
 ) -> Projected:
-    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `out` where it is given."""
+    """Feature rows of the Gaussians that reach the picture, or what slots there are; into `features` if given."""
     announce_compilation()
-    n = len(gaussians)
-    if out is None:
+    n, low_pass = len(gaussians), settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass
+    if features is None:
         features = np.empty((n, SURFEL_ROW if gaussians.is_surfels else ELLIPSE_ROW), np.float32)
-        out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
-    *geometry, sh = values_of(gaussians)
-    run_ranges(
-        project_range,
-        n,
-        *geometry,
-        sh,
-        sh.reshape(n, 3 * sh.shape[1]).view(np.int32),
-        pack_camera(camera),
-        *tile_grid(camera),
-        np.array((0, 0, *tile_grid(camera)) if slots is None else _rectangle(slots >= 0), np.int64),
-        float(settings.near),
-        float(settings.surfel_low_pass if gaussians.is_surfels else settings.low_pass),
-        float(settings.alpha_min),
-        bool(gaussians.antialiased),
-        with_colour,
-        out.features,
-        out.rects,
-        out.states,
-    )
+    out = Projected(features, np.empty((n, 4), np.int16), np.empty(n, np.int8))
+    grid = tile_grid(camera)
+    wanted = np.ones(grid[::-1], bool) if slots is None else slots >= 0
+    (top, bottom), (left, right) = ((rows.start, rows.stop) for rows in bounds(wanted))
+    tiles = np.array([left, top, right, bottom, *grid], np.int64)
+    limits = float(settings.near), float(low_pass), float(settings.alpha_min), bool(gaussians.antialiased)
+    given = values_of(gaussians), pack_camera(camera), tiles, limits, with_colour
+    run_ranges(project_range, n, *given, out.features, out.rects, out.states)
     return out
-
-
-def _rectangle(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """First column and row of what is set, and one past the last."""
-    rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return (cols[0], rows[0], cols[-1] + 1, rows[-1] + 1) if len(rows) else (0, 0, 0, 0)
 
 
 def raw(values: np.ndarray) -> np.ndarray:
@@ -97,8 +61,7 @@ def raw(values: np.ndarray) -> np.ndarray:
 
 def values_of(gaussians: Gaussians) -> tuple[np.ndarray, ...]:
     """What is stored of Gaussians, in the order in which all kernels take it and give gradients."""
-    g = gaussians
-    return tuple(raw(values) for values in (g.means, g.log_scales, g.quats, g.opacity_logits, g.sh))
+    return tuple(raw(getattr(gaussians, name)) for name in ARRAYS)
 
 
 def tile_grid(camera: Camera) -> tuple[int, int]:
@@ -107,50 +70,35 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 
 
 def pack_camera(camera: Camera) -> np.ndarray:
-    """What project_range reads of a camera, [23] float64; the Jacobian's bounds are gsplat's."""
+    """What project_range reads of a camera, [22] float64; the Jacobian's bounds are gsplat's."""
     margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * camera.width, 0.5 * FRUSTUM_MARGIN * camera.height
-    bounds = [
+    slopes = [
         (-camera.cx - margin_x) / camera.fx,
         (camera.width - camera.cx + margin_x) / camera.fx,
         (-camera.cy - margin_y) / camera.fy,
         (camera.height - camera.cy + margin_y) / camera.fy,
     ]
-    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
-    return np.concatenate([camera.R.ravel(), camera.t, intrinsics, camera.centre, bounds]).astype(np.float64)
+    return np.append(pack_pinhole(camera), slopes)
 
 
-def pass_flags(passes: frozenset[str]) -> np.ndarray:
-    """blend_range's flags, [6] bool: rgb, expected depth, median depth, normals, distortion, numbers for depths.
-
-    Raises
-    ------
-    ValueError
-        If a pass is unknown.
-    """
+def pass_flags(passes: frozenset[str]) -> Flags:
+    """blend_range's flags; a ValueError if a pass is unknown."""
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
-    wanted = ["rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes]
-    return np.array([*wanted, False])
+    return ("rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes, False)
 
 
-def pack_limits(settings: RasterSettings) -> np.ndarray:
-    """blend_range's limits, [6] float32."""
+def pack_limits(settings: RasterSettings) -> tuple[np.float32, ...]:
+    """blend_range's limits."""
     disc = HALF_LOG2E / settings.surfel_low_pass
-    limits = [settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near]
-    return np.array(limits, np.float32)
+    limits = (settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near)
+    return tuple(np.float32(value) for value in limits)
 
 
 def padded_size(camera: Camera) -> tuple[int, int]:
     """Height and width of the kernels' pictures: whole blocks."""
     return -(-int(camera.height) // BLOCK) * BLOCK, -(-int(camera.width) // BLOCK) * BLOCK
-
-
-def empty_pictures(camera: Camera, flags: np.ndarray) -> tuple[np.ndarray, ...]:
-    """rgb, alpha, expected, median, normals, distortion of whole blocks, flat: zeros where asked for, else nothing."""
-    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
-    height, width = padded_size(camera)
-    return tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
 
 
 def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
@@ -162,74 +110,77 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
     return raw(np.pad(picture, missing) if missing[0][1] or missing[1][1] else picture).reshape(-1)
 
 
-def as_rendering(pictures: tuple[np.ndarray, ...], camera: Camera, ignored: int) -> Rendering:
-    """The kernels' pictures without what pads them to whole blocks."""
-    height, width = padded_size(camera)
-    cut = []
-    for flat, channels in zip(pictures, CHANNELS):
-        picture = flat.reshape(height if len(flat) else 0, width if len(flat) else 0, channels)
-        picture = picture[: camera.height, : camera.width]
-        cut.append(np.ascontiguousarray(picture if channels == 3 else picture[..., 0]))
-    rgb, alpha, expected, median, normals, distortion = cut
-    return Rendering(rgb, alpha, expected, median, normals, distortion, ignored)
-
-
-def whole_picture(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Slots [down, across] int32 of all tiles and their wanted blocks [S] uint64, for a picture without a region."""
-    across, down = tile_grid(camera)
-    columns = np.minimum(-(-(camera.width - TILE * np.arange(across)) // 4), 8).astype(np.uint64)
-    rows = np.minimum(-(-(camera.height - TILE * np.arange(down)) // 4), 8).astype(np.uint64)
-    first_column = np.uint64(0x0101010101010101) >> (np.uint64(64) - np.uint64(8) * rows)
-    wanted = ((np.uint64(1) << columns) - np.uint64(1))[None] * first_column[:, None]
-    return np.arange(across * down, dtype=np.int32).reshape(down, across), wanted.ravel()
-
-
-def wanted_tiles(camera: Camera, pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """As `whole_picture`, but only of the 4×4 blocks that hold one of the pixels [H, W] bool, where they are given."""
+def wanted_tiles(camera: Camera, pixels: Mask) -> tuple[np.ndarray, np.ndarray]:
+    """Slots [down, across] int32 of the tiles, and blocks [S] uint64 of each slot, with wanted pixels [H, W] bool."""
     if pixels is None:
-        return whole_picture(camera)
+        return _all_tiles(camera.height, camera.width)
     if pixels.shape != (camera.height, camera.width):
         raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
-    blocks = wanted_blocks(camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
+    blocks = wanted_blocks(pixels)
     return slots_of(blocks > 0), blocks[blocks > 0]
 
 
-def wanted_blocks(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] uint8 which is not 0."""
-    across, down = tile_grid(camera)
-    blocks = np.empty(across * down, np.uint64)
-    region_blocks(pixels, across, blocks)
-    return blocks.reshape(down, across)
+@lru_cache(maxsize=16)
+def _all_tiles(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    blocks = wanted_blocks(np.ones((height, width), bool))
+    return slots_of(blocks > 0), blocks.ravel()
 
 
-def slots_of(
-    wanted: np.ndarray,  # [down, across] bool
-) -> np.ndarray:
-    """Slots [down, across] int32 of the wanted tiles in row-major order, −1 elsewhere."""
+def wanted_blocks(pixels: np.ndarray) -> np.ndarray:
+    """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] which is not 0."""
+    blocks = np.empty([-(-side // TILE) for side in pixels.shape], np.uint64)
+    region_blocks(np.require(pixels, bool, ["C", "W"]).view(np.uint8), blocks)
+    return blocks
+
+
+def slots_of(wanted: np.ndarray) -> np.ndarray:
+    """Slots [down, across] int32 of the wanted tiles [down, across] bool in row-major order, −1 elsewhere."""
     return np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1).astype(np.int32)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What the way back needs of a rendering."""
+    """Lists to blend into a view, and, once they are, what the way back needs."""
 
     gaussians: Gaussians  # those that get gradients
     view: Projected  # of them
     camera: Camera
     settings: RasterSettings
-    flags: np.ndarray
-    features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
+    flags: Flags
     lists: TileLists
+    features: np.ndarray  # [·, 16 or 32] that the lists' entries mean: perhaps frozen ones, then those of `view`
     wanted: np.ndarray  # [S] uint64
-    shifts: np.ndarray  # [S] float32
-    masks: np.ndarray  # [P] uint64
-    closings: np.ndarray  # uint64
-    ends: np.ndarray  # [S] int64
-    states: np.ndarray  # [S, TILE_STATE] float32
-    back: np.ndarray  # [S, TILE_STATE] or empty
+    shifts: np.ndarray  # [S] float32, see depth_shifts
+    back: np.ndarray = field(default_factory=lambda: NO_STATES)  # [S, TILE_STATE] or empty
+    kept: tuple[np.ndarray, ...] = ()  # what blend_range keeps
+
+    def given(self) -> tuple[Any, ...]:
+        """As kernels over tiles take it."""
+        limits, background = pack_limits(self.settings), np.asarray(self.settings.background, np.float32)
+        surfels = self.gaussians.is_surfels
+        return self.features, surfels, limits, self.wanted, self.shifts, background, self.back
 
     def backward(self, gradients: PictureGradients) -> Gradients:
-        return _backward(self, gradients)
+        camera, pictures = self.camera, {f.name: getattr(gradients, f.name) for f in fields(gradients)}
+        for name, picture in pictures.items():
+            expected = (camera.height, camera.width, *((3,) if name in ("rgb", "normals") else ()))
+            if picture.size and picture.shape != expected:
+                raise ValueError(f"gradient of {name}: expected shape {expected}, got {picture.shape}")
+        given = tuple(padded(picture, camera) for picture in pictures.values())
+        flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4, 5))
+        names = ("rgb", "expected_depth", "median_depth", "normals", "distortion")
+        missing = [name for name, wanted, drawn in zip(names, flags, self.flags) if wanted and not drawn]
+        if missing:
+            raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
+        records = np.empty(len(self.lists.records) * RECORD, np.float32)
+        active = len(self.features) - len(self.gaussians), self.lists.records, records
+        over_tiles(unblend_range, self.lists, camera, self.given(), self.kept, flags, given, *active)
+        values = values_of(self.gaussians)
+        found = tuple(np.zeros(v.shape, np.float32) for v in values)
+        how = pack_camera(camera), float(self.settings.low_pass), bool(self.gaussians.antialiased)
+        drawn = self.view.features, self.view.states, self.lists.spans, records
+        run_ranges(unproject_range, len(self.gaussians), values, *how, *drawn, found)
+        return Gradients(*found)
 
 
 def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
@@ -241,137 +192,42 @@ def depth_shifts(lists: TileLists, features: np.ndarray) -> np.ndarray:
     return shifts
 
 
+def prepare(
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, flags: Flags, pixels: Mask, with_records: bool
+) -> Trace:
+    """All that is done before blending."""
+    slots, wanted = wanted_tiles(camera, pixels)
+    view = project(gaussians, camera, settings, flags[0], slots)
+    lists = tile_lists(view, slots, with_records)
+    shifts = depth_shifts(lists, view.features)
+    return Trace(gaussians, view, camera, settings, flags, lists, view.features, wanted, shifts)
+
+
 def trace(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
 ) -> tuple[Rendering, Trace]:
-    flags = pass_flags(passes)
-    slots, wanted = whole_picture(camera)
-    view = project(gaussians, camera, settings, bool(flags[0]), slots=slots)
-    lists = tile_lists(view.features, view.rects, view.states, slots, with_records=True)
-    shifts = depth_shifts(lists, view.features)
-    pictures, kept = blend(gaussians, view, camera, settings, flags, view.features, lists, wanted, shifts, keep=True)
-    return as_rendering(pictures, camera, view.ignored), kept
+    return blend(prepare(gaussians, camera, settings, pass_flags(passes), None, with_records=True), keep=True)
 
 
-def blend(
-    gaussians: Gaussians,
-    view: Projected,
-    camera: Camera,
-    settings: RasterSettings,
-    flags: np.ndarray,
-    features: np.ndarray,
-    lists: TileLists,
-    wanted: np.ndarray,
-    shifts: np.ndarray,
-    keep: bool,
-    front: np.ndarray = NO_STATES,
-    back: np.ndarray = NO_STATES,
-) -> tuple[tuple[np.ndarray, ...], Trace]:
-    """Blend the lists into pictures."""
-    slot_count, entry_count = len(lists.tiles), len(lists.entries)
-    kept = Trace(
-        gaussians,
-        view,
-        camera,
-        settings,
-        flags,
-        features,
-        lists,
-        wanted,
-        shifts,
-        np.empty(entry_count, np.uint64) if keep else NO_MASKS,
-        np.empty(entry_count // CHECK + slot_count + 1, np.uint64) if keep else NO_MASKS,
-        np.empty(slot_count, np.int64),
-        np.empty((slot_count, TILE_STATE), np.float32) if keep else NO_STATES,
-        back,
+def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Rendering, Trace]:
+    """Blend the lists, behind what is in front, into pictures."""
+    slots, entries = len(traced.lists.tiles), len(traced.lists.entries)
+    kept = (
+        np.empty(entries if keep else 0, np.uint64),
+        np.empty(entries // CHECK + slots + 1 if keep else 0, np.uint64),
+        np.empty(slots, np.int64),
+        np.empty((slots if keep else 0, TILE_STATE), np.float32),
     )
-    pictures = empty_pictures(camera, flags)
-    over_tiles(
-        blend_range,
-        lists,
-        camera,
-        features,
-        gaussians.is_surfels,
-        pack_limits(settings),
-        shifts,
-        flags,
-        wanted,
-        front,
-        kept.masks,
-        kept.closings,
-        kept.ends,
-        kept.states,
-        np.asarray(settings.background, np.float32),
-        back,
-        pictures,
-    )
-    return pictures, kept
-
-
-def _backward(traced: Trace, given: PictureGradients) -> Gradients:
-    lists, settings = traced.lists, traced.settings
-    check_gradients(given, traced.camera)
-    gradients = [padded(getattr(given, f.name), traced.camera) for f in fields(given)]
-    flags = np.array([gradients[k].size > 0 for k in (0, 2, 3, 4, 5)])
-    missing = [
-        name
-        for name, g, f in zip(("rgb", "expected_depth", "median_depth", "normals", "distortion"), flags, traced.flags)
-        if g and not f
-    ]
-    if missing:
-        raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
-    records = np.empty((len(lists.records), RECORD), np.float32)
-    over_tiles(
-        unblend_range,
-        lists,
-        traced.camera,
-        traced.features,
-        traced.gaussians.is_surfels,
-        pack_limits(settings),
-        traced.shifts,
-        flags,
-        traced.wanted,
-        traced.masks,
-        traced.closings,
-        traced.ends,
-        traced.states,
-        np.asarray(settings.background, np.float32),
-        traced.back,
-        tuple(gradients),
-        len(traced.features) - len(traced.gaussians),
-        lists.records,
-        records.reshape(-1),
-    )
-    return _unproject(traced, records.reshape(-1))
-
-
-def _unproject(traced: Trace, records: np.ndarray) -> Gradients:
-    """Gradients of the traced Gaussians."""
-    values = values_of(traced.gaussians)
-    found = tuple(np.empty(v.shape, np.float32) for v in values)
-    run_ranges(
-        unproject_range,
-        len(traced.gaussians),
-        *values,
-        pack_camera(traced.camera),
-        float(traced.settings.low_pass),
-        bool(traced.gaussians.antialiased),
-        traced.view.features,
-        traced.view.states,
-        traced.lists.spans,
-        records,
-        *found,
-    )
-    return Gradients(*found)
-
-
-def check_gradients(given: PictureGradients, camera: Camera) -> None:
-    """Every picture's gradient is empty or has the picture's shape."""
-    for f in fields(given):
-        value = getattr(given, f.name)
-        expected = (camera.height, camera.width, *((3,) if f.name in ("rgb", "normals") else ()))
-        if value.size and value.shape != expected:
-            raise ValueError(f"gradient of {f.name}: expected shape {expected}, got {value.shape}")
+    (height, width), flags = padded_size(traced.camera), traced.flags
+    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
+    pictures = tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
+    over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, flags, front, pictures)
+    shapes = [(height, width, c) if w else (0, 0, c) for w, c in zip(wanted, CHANNELS)]
+    cut = [p.reshape(shape)[: traced.camera.height, : traced.camera.width] for p, shape in zip(pictures, shapes)]
+    cut = [np.ascontiguousarray(p if p.shape[2] == 3 else p[..., 0]) for p in cut]
+    rgb, alpha, expected, median, normals, distortion = cut
+    drawn = Rendering(rgb, alpha, expected, median, normals, distortion, traced.view.ignored)
+    return drawn, replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
@@ -379,40 +235,23 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     order = np.argsort(lists.starts - lists.stops, kind="stable")
     threads = thread_count()
     chunks = 1 if threads == 1 else min(6 * threads, max(threads, len(order) // 4))
-    across, _ = tile_grid(camera)
-    shared = (lists.tiles, across, padded_size(camera)[1], lists.starts, lists.stops, lists.entries)
-    parallel_map(
-        lambda part: kernel_range(0, len(part), part, *shared, *args),
-        [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)],
-    )
+    packed = lists.tiles, tile_grid(camera)[0], padded_size(camera)[1], lists.starts, lists.stops, lists.entries
+    parts = [np.ascontiguousarray(order[k::chunks]) for k in range(chunks)]
+    parallel_map(lambda part: kernel_range(part, packed, *args), parts)
 
 
-def contributions(
-    gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
-) -> Contributions:
+def contributions(gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: Mask) -> Contributions:
     labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
     total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
     return Contributions(total[0], peak)
 
 
-def label_weights(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    labels: np.ndarray,
-    count: int,
-    rows: np.ndarray | None,
-) -> np.ndarray:
-    return _weigh(gaussians, camera, settings, labels, count, rows)[0]
+def label_weights(gaussians: Gaussians, camera: Camera, labels: np.ndarray, count: int, rows: Mask) -> np.ndarray:
+    return _weigh(gaussians, camera, RasterSettings(), labels, count, rows)[0]
 
 
 def _weigh(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: RasterSettings,
-    labels: np.ndarray,  # [H, W] 0 … count
-    count: int,
-    rows: np.ndarray | None,  # [N] bool: whose weights are asked for
+    gaussians: Gaussians, camera: Camera, settings: RasterSettings, labels: np.ndarray, count: int, rows: Mask
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
     shape = (camera.height, camera.width)
@@ -420,22 +259,23 @@ def _weigh(
         raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")
     view = project(gaussians, camera, settings, with_colour=False)
     counted = np.require(labels, np.uint8, ["C", "W"])
-    wanted = wanted_blocks(camera, counted) > 0
+    blocks = wanted_blocks(counted)
+    wanted = blocks > 0
     if rows is not None:
         touched = np.zeros(wanted.shape, bool)
         mark_touched(view.rects, view.states, rows, touched)
         wanted &= touched
-    lists = tile_lists(view.features, view.rects, view.states, slots_of(wanted), with_records=False)
+    lists = tile_lists(view, slots_of(wanted), with_records=False)
     sums, peaks = np.zeros((count, len(lists.entries)), np.float32), np.zeros(len(lists.entries), np.float32)
-    limits = pack_limits(settings)
-    over_tiles(weigh_range, lists, camera, view.features, gaussians.is_surfels, limits, counted, sums, peaks)
+    given = view.features, gaussians.is_surfels, pack_limits(settings), blocks[wanted]
+    over_tiles(weigh_range, lists, camera, *given, counted, sums, peaks)
     total, peak = np.zeros((count, len(gaussians)), np.float32), np.zeros(len(gaussians), np.float32)
     gather_weights(lists.entries, sums, peaks, total, peak)
     return total, peak
 
 
-def touched_window(gaussians: Gaussians, camera: Camera, margin: int, settings: RasterSettings) -> Window:
-    view = project(gaussians, camera, settings, with_colour=False)
+def touched_window(gaussians: Gaussians, camera: Camera, margin: int) -> Window:
+    view = project(gaussians, camera, RasterSettings(), with_colour=False)
     rects = view.rects[view.states == DRAWN]
     if not len(rects):
         return slice(0, 1), slice(0, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,56 +12,44 @@ from ..compute.jit import exact_kernel
 from ..compute.threads import run_ranges
 from ..gaussians import Gaussians
 from . import cpu
-from .bin import TileLists, tile_lists
+from .bin import TileLists
 from .project import BLUE, RED
 from .surface import meet_range
-from .types import RasterSettings, Rendering
+from .types import Mask, RasterSettings, Rendering
 
-NUMBERS_ONLY = np.array([False, False, True, False, False, True])  # blend_range's flags
+NUMBERS_ONLY = (False, False, True, False, False, True)  # blend_range's flags
 
 
 class CpuDrawing:
     """See `Drawing`. Not for two threads at once."""
 
     def __init__(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        with_colour: bool,
-        pixels: np.ndarray | None,
+        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
     ) -> None:
-        self.gaussians, self.camera, self.settings, self.with_colour = gaussians, camera, settings, with_colour
-        self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
-        self._view = cpu.project(gaussians, camera, settings, with_colour, slots=self._slots)
-        view = self._view
-        self._lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
+        self.gaussians, self.camera, self.with_colour = gaussians, camera, with_colour
+        flags = (with_colour, False, False, False, False, False)
+        self._made = cpu.prepare(gaussians, camera, settings, flags, pixels, with_records=False)
 
-    def render(self, passes: frozenset[str], pixels: np.ndarray | None = None) -> Rendering:
+    def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
         flags = cpu.pass_flags(passes)
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
         if pixels is None:
-            return self._draw(flags, self.settings, self._lists, self._wanted)
-        blocks = cpu.wanted_blocks(self.camera, np.require(pixels, bool, ["C", "W"]).view(np.uint8))
-        return self._draw(flags, self.settings, self._lists, self._wanted & blocks[self._slots >= 0])
+            return self._draw(flags)
+        there = cpu.wanted_blocks(pixels).ravel()[self._made.lists.tiles]
+        return self._draw(flags, wanted=self._made.wanted & there)
 
-    def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        lists = self._lists if gone is None else _without(self._lists, gone)
+    def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
+        lists = self._made.lists if gone is None else _without(self._made.lists, gone)
+        shifts = cpu.depth_shifts(lists, self._made.features)
         if self.gaussians.is_surfels:
-            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), self.settings, lists, self._wanted)
+            drawn = self._draw(cpu.pass_flags(frozenset({"depth"})), lists=lists, shifts=shifts)
             return drawn.median_depth, drawn.alpha
-        drawn = self._draw(NUMBERS_ONLY, self.settings, lists, self._wanted)
-        depth = np.zeros(drawn.alpha.shape, np.float32)
-        run_ranges(
-            meet_range,
-            len(depth),
-            drawn.median_depth.view(np.int32),
-            *cpu.values_of(self.gaussians)[:3],
-            cpu.pack_camera(self.camera),
-            float(self.settings.low_pass),
-            depth,
-        )
+        drawn = self._draw(NUMBERS_ONLY, lists=lists, shifts=shifts)
+        depth, numbers = np.zeros(drawn.alpha.shape, np.float32), drawn.median_depth.view(np.int32)
+        means, log_scales, quats, _, _ = cpu.values_of(self.gaussians)
+        camera, low_pass = cpu.pack_camera(self.camera), float(self._made.settings.low_pass)
+        run_ranges(meet_range, len(depth), numbers, means, log_scales, quats, camera, low_pass, depth)
         return depth, drawn.alpha
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
@@ -68,18 +57,12 @@ class CpuDrawing:
             raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {chosen.shape}")
         if self.with_colour:
             raise ValueError("footprint: this drawing has colours; make one without")
-        _paint(self._lists.entries, chosen, self._view.features)
-        black = replace(self.settings, background=(0.0, 0.0, 0.0))
-        drawn = self._draw(cpu.pass_flags(frozenset({"rgb"})), black, self._lists, self._wanted)
-        return np.ascontiguousarray(drawn.rgb[..., 0])
+        _paint(self._made.lists.entries, chosen, self._made.features)
+        black = replace(self._made.settings, background=(0.0, 0.0, 0.0))
+        return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb[..., 0])
 
-    def _draw(self, flags: np.ndarray, settings: RasterSettings, lists: TileLists, wanted: np.ndarray) -> Rendering:
-        view, features = self._view, self._view.features
-        shifts = cpu.depth_shifts(lists, features)
-        pictures, _ = cpu.blend(
-            self.gaussians, view, self.camera, settings, flags, features, lists, wanted, shifts, keep=False
-        )
-        return cpu.as_rendering(pictures, self.camera, view.ignored)
+    def _draw(self, flags: cpu.Flags, **changed: Any) -> Rendering:
+        return cpu.blend(replace(self._made, flags=flags, **changed), keep=False)[0]
 
 
 def _without(lists: TileLists, gone: np.ndarray) -> TileLists:

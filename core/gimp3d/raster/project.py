@@ -3,21 +3,21 @@ for surfels (Huang 2024), SH colour.
 
 Geometry is computed in float64 and NaN-safe: the rows come from files, so infinities and NaN must be seen as such,
 scenes may lie far from the origin, and a giant's covariance would overflow float32. What blending reads is float32.
-Rows are staged CHUNK at a time into planes of one scratch array, because loops over such planes vectorise.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import float32, float64, int32, int64
 
-from .. import sh as harmonics
 from ..compute.exp_log import LOG2E, exp64, log2_64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import load1, store1
-from ..gaussians import SH_C0
+from .harmonics import BASIS_PLANES, sh_basis
+from .staging import CHUNK, LOGIT, S0, S1, STAGED, X, Z, facing_normal, load3, rotation_of, stage, store3, to_camera
 
 TILE = 32  # px, side of a tile
 
@@ -50,21 +50,25 @@ EXPONENT_BITS = np.int32(0x7F800000)  # a float32 is finite if its magnitude bit
 MAGNITUDE_BITS = np.int32(0x7FFFFFFF)
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
-# Real spherical harmonics: the magnitudes of sh.py's factors.
-C0, C1 = np.float32(SH_C0), np.float32(harmonics.C1)
-C2 = tuple(np.float32(abs(harmonics.C2[k])) for k in (0, 2, 4))
-C3 = tuple(np.float32(abs(harmonics.C3[k])) for k in (0, 1, 2, 3, 5))
-TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
-
-# Scratch planes of a chunk: what is staged, then what comes out of it
-CHUNK = 64
-X, Y, Z, QW, QX, QY, QZ, S0, S1, S2, LOGIT = range(0, 11 * CHUNK, CHUNK)  # camera coordinates of the centre
-OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2 = range(11 * CHUNK, 19 * CHUNK, CHUNK)
-OUT_NX, OUT_NY, OUT_NZ = range(19 * CHUNK, 22 * CHUNK, CHUNK)
-OUT_CENTRE_X, OUT_CENTRE_Y, OUT_UX, OUT_UY, OUT_VX, OUT_VY, OUT_AX, OUT_AY = range(22 * CHUNK, 30 * CHUNK, CHUNK)
+# Scratch planes after those of what is staged
+OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2, OUT_NX = range(
+    STAGED, 20 * CHUNK, CHUNK
+)
+OUT_CENTRE_X, _, _, OUT_UY, _, _, OUT_AX, OUT_AY = range(22 * CHUNK, 30 * CHUNK, CHUNK)  # as in a feature row
 PLANES = 30
-SH_X, SH_Y, SH_Z = 16 * CHUNK, 17 * CHUNK, 18 * CHUNK  # after 16 planes of the SH basis: the direction
-BASIS_PLANES = 19
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Gaussians projected into a camera."""
+
+    features: np.ndarray  # [N, 16 or 32] float32
+    rects: np.ndarray  # [N, 4] int16
+    states: np.ndarray  # [N] int8
+
+    @property
+    def ignored(self) -> int:
+        return int(np.count_nonzero(self.states == UNUSABLE))
 
 
 @inline_kernel
@@ -96,15 +100,6 @@ def surfel_of(flat, o):
 
 
 @inline_kernel
-def _finite_bits(bits, i):
-    """Whether row i of float32 values, seen as int32 so that this vectorises, has no NaN or infinity."""
-    largest = int32(0)
-    for k in range(bits.shape[1]):
-        largest = max(largest, bits[i, k] & MAGNITUDE_BITS)
-    return largest < EXPONENT_BITS
-
-
-@inline_kernel
 def _usable(i, means, log_scales, quats, opacity_logits):
     """`Gaussians.usable` of one row, but for its SH coefficients."""
     ok = not math.isnan(opacity_logits[i])
@@ -120,78 +115,15 @@ def _usable(i, means, log_scales, quats, opacity_logits):
 
 
 @exact_kernel
-def sh_basis(s, n, camera, bands, basis):
-    """Real spherical harmonics of the directions from the camera to the first n staged centres: planes of `basis`."""
-    for k in range(n):
-        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
-        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
-        x, y, z = x * inverse, y * inverse, z * inverse
-        store1(basis, SH_X + k, float32(camera[0] * x + camera[3] * y + camera[6] * z))
-        store1(basis, SH_Y + k, float32(camera[1] * x + camera[4] * y + camera[7] * z))
-        store1(basis, SH_Z + k, float32(camera[2] * x + camera[5] * y + camera[8] * z))
-        store1(basis, k, C0)
-    if bands > 1:
-        for k in range(n):
-            store1(basis, 1 * CHUNK + k, -C1 * load1(basis, SH_Y + k))
-            store1(basis, 2 * CHUNK + k, C1 * load1(basis, SH_Z + k))
-            store1(basis, 3 * CHUNK + k, -C1 * load1(basis, SH_X + k))
-    if bands > 4:
-        for k in range(n):
-            x, y, z = load1(basis, SH_X + k), load1(basis, SH_Y + k), load1(basis, SH_Z + k)
-            xx, yy, zz = x * x, y * y, z * z
-            store1(basis, 4 * CHUNK + k, C2[0] * x * y)
-            store1(basis, 5 * CHUNK + k, -C2[0] * y * z)
-            store1(basis, 6 * CHUNK + k, C2[1] * (TWO * zz - xx - yy))
-            store1(basis, 7 * CHUNK + k, -C2[0] * x * z)
-            store1(basis, 8 * CHUNK + k, C2[2] * (xx - yy))
-    if bands > 9:
-        for k in range(n):
-            x, y, z = load1(basis, SH_X + k), load1(basis, SH_Y + k), load1(basis, SH_Z + k)
-            xx, yy, zz = x * x, y * y, z * z
-            store1(basis, 9 * CHUNK + k, -C3[0] * y * (THREE * xx - yy))
-            store1(basis, 10 * CHUNK + k, C3[1] * x * y * z)
-            store1(basis, 11 * CHUNK + k, -C3[2] * y * (FOUR * zz - xx - yy))
-            store1(basis, 12 * CHUNK + k, C3[3] * z * (TWO * zz - THREE * (xx + yy)))
-            store1(basis, 13 * CHUNK + k, -C3[2] * x * (FOUR * zz - xx - yy))
-            store1(basis, 14 * CHUNK + k, C3[4] * z * (xx - yy))
-            store1(basis, 15 * CHUNK + k, -C3[0] * x * (xx - THREE * yy))
-
-
-@inline_kernel
-def rotation(w, x, y, z):
-    """The rotation matrix of a quaternion of any length, row by row."""
-    k = 2.0 / (w * w + x * x + y * y + z * z)
-    return (
-        1.0 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y),
-        k * (x * y + w * z), 1.0 - k * (x * x + z * z), k * (y * z - w * x),
-        k * (x * z - w * y), k * (y * z + w * x), 1.0 - k * (x * x + y * y),
-    )  # fmt: skip
-
-
-@inline_kernel
-def to_camera(r, x, y, z):
-    """A direction in the world's axes in the camera's."""
-    return (
-        r[0] * x + r[1] * y + r[2] * z,
-        r[3] * x + r[4] * y + r[5] * z,
-        r[6] * x + r[7] * y + r[8] * z,
-    )
-
-
-@inline_kernel
-def load_quat(s, k):
-    return load1(s, QW + k), load1(s, QX + k), load1(s, QY + k), load1(s, QZ + k)
-
-
-@exact_kernel
 def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
     """The first n staged 3D Gaussians as ellipses in the image."""
     r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = r
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
-    left, right, top, bottom = camera[19], camera[20], camera[21], camera[22]
+    left, right, top, bottom = camera[18], camera[19], camera[20], camera[21]
     for k in range(n):
-        x, y, inverse_z = load1(s, X + k), load1(s, Y + k), 1.0 / load1(s, Z + k)
+        x, y, z = load3(s, X, k)
+        inverse_z = 1.0 / z
         # Rows of J R: the Jacobian of the perspective times the rotation. Far outside the frustum it is
         # evaluated at the bounds, or else a splat beside the camera would flood the view.
         tan_x, tan_y = x * inverse_z, y * inverse_z
@@ -200,9 +132,10 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         a0, a1, a2 = j00 * r00 + j02 * r20, j00 * r01 + j02 * r21, j00 * r02 + j02 * r22
         b0, b1, b2 = j11 * r10 + j12 * r20, j11 * r11 + j12 * r21, j11 * r12 + j12 * r22
 
-        qw, qx, qy, qz = load_quat(s, k)
-        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
-        s0, s1, s2 = exp64(load1(s, S0 + k)), exp64(load1(s, S1 + k)), exp64(load1(s, S2 + k))
+        q = rotation_of(s, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = q
+        s0, s1, s2 = load3(s, S0, k)
+        s0, s1, s2 = exp64(s0), exp64(s1), exp64(s2)
         # The image covariance [[uu, uv], [uv, vv]] from u, v = rows of J R Q S. Its determinant is |u × v|²,
         # so that with the low-pass nothing is subtracted: uu·vv − uv² would cancel for needles.
         u0, v0 = (a0 * q00 + a1 * q10 + a2 * q20) * s0, (b0 * q00 + b1 * q10 + b2 * q20) * s0
@@ -222,23 +155,13 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         whiten_xx = math.sqrt(HALF_LOG2E * yy / det)
         store1(s, OUT_X + k, fx * tan_x + cx)
         store1(s, OUT_Y + k, fy * tan_y + cy)
-        store1(s, OUT_XX + k, whiten_xx)
-        store1(s, OUT_XY + k, -whiten_xx * uv / yy)
-        store1(s, OUT_YY + k, math.sqrt(HALF_LOG2E / yy))
+        store3(s, OUT_XX, k, whiten_xx, -whiten_xx * uv / yy, math.sqrt(HALF_LOG2E / yy))
         store1(s, OUT_HALF_WIDTH + k, radius * math.sqrt(xx))
         store1(s, OUT_HALF_HEIGHT + k, radius * math.sqrt(yy))
         store1(s, OUT_LOG2 + k, log2_opacity)
 
-        # the flattest axis is the surface normal
-        third, first = (s2 <= s0) & (s2 <= s1), s0 <= s1
-        wx = q02 if third else (q00 if first else q01)
-        wy = q12 if third else (q10 if first else q11)
-        wz = q22 if third else (q20 if first else q21)
-        nx, ny, nz = to_camera(r, wx, wy, wz)
-        facing = -1.0 if nx * x + ny * y + nz * load1(s, Z + k) > 0.0 else 1.0
-        store1(s, OUT_NX + k, facing * nx)
-        store1(s, OUT_NY + k, facing * ny)
-        store1(s, OUT_NZ + k, facing * nz)
+        nx, ny, nz, _, _, _ = facing_normal(r, q, s0, s1, s2, x, y, z)  # of the surface
+        store3(s, OUT_NX, k, nx, ny, nz)
 
 
 @exact_kernel
@@ -247,9 +170,8 @@ def _surfels(s, n, camera, low_pass, log2_alpha_min):
     r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     for k in range(n):
-        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
-        qw, qx, qy, qz = load_quat(s, k)
-        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
+        x, y, z = load3(s, X, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation_of(s, k)
         tx, ty, tz = to_camera(r, q00, q10, q20)
         bx, by, bz = to_camera(r, q01, q11, q21)
         nx, ny, nz = to_camera(r, q02, q12, q22)
@@ -301,15 +223,9 @@ def _surfels(s, n, camera, low_pass, log2_alpha_min):
         store1(s, OUT_HALF_HEIGHT + k, math.sqrt(syy) if bounded else FAR)
         store1(s, OUT_LOG2 + k, log2_opacity)
         facing = -1.0 if plane > 0.0 else 1.0
-        store1(s, OUT_NX + k, facing * nx)
-        store1(s, OUT_NY + k, facing * ny)
-        store1(s, OUT_NZ + k, facing * nz)
-        store1(s, OUT_CENTRE_X + k, mean_x)
-        store1(s, OUT_CENTRE_Y + k, mean_y)
-        store1(s, OUT_UX + k, u_x)
-        store1(s, OUT_UY + k, u_y)
-        store1(s, OUT_VX + k, v_x)
-        store1(s, OUT_VY + k, v_y)
+        store3(s, OUT_NX, k, facing * nx, facing * ny, facing * nz)
+        store3(s, OUT_CENTRE_X, k, mean_x, mean_y, u_x)
+        store3(s, OUT_UY, k, u_y, v_x, v_y)
         store1(s, OUT_AX + k, a_x)
         store1(s, OUT_AY + k, a_y)
 
@@ -332,7 +248,7 @@ def _misses(x, y, z, log_scale, camera, low_pass, reach, tiles):
     beyond = max(TILE * tiles[1] - v, v - TILE * tiles[3])
     if max(beside, beyond) <= 0.0:
         return False
-    slope_x, slope_y = min(max(tan_x, camera[19]), camera[20]), min(max(tan_y, camera[21]), camera[22])
+    slope_x, slope_y = min(max(tan_x, camera[18]), camera[19]), min(max(tan_y, camera[20]), camera[21])
     size = exp64(log_scale) * inverse_z
     across, down = camera[12] * size, camera[13] * size
     squared_width = reach * reach * (across * across * (1.0 + slope_x * slope_x) + low_pass)
@@ -340,48 +256,23 @@ def _misses(x, y, z, log_scale, camera, low_pass, reach, tiles):
     return (beside > 0.0 and beside * beside > squared_width) or (beyond > 0.0 and beyond * beyond > squared_height)
 
 
-@inline_kernel
-def stage(s, n, i, means, log_scales, quats, opacity_logits, camera):
-    """Put Gaussian i into place n of the scratch planes, its mean in camera coordinates."""
-    x, y, z = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
-    store1(s, X + n, camera[0] * x + camera[1] * y + camera[2] * z + camera[9])
-    store1(s, Y + n, camera[3] * x + camera[4] * y + camera[5] * z + camera[10])
-    store1(s, Z + n, camera[6] * x + camera[7] * y + camera[8] * z + camera[11])
-    for k in range(4):
-        store1(s, QW + k * CHUNK + n, float64(quats[i, k]))
-    for k in range(log_scales.shape[1]):
-        store1(s, S0 + k * CHUNK + n, float64(log_scales[i, k]))
-    store1(s, LOGIT + n, float64(opacity_logits[i]))
-
-
 @exact_kernel
-def project_range(
-    lo,
-    hi,
-    means,  # [N, 3]
-    log_scales,  # [N, 3], or [N, 2] for surfels
-    quats,  # [N, 4] wxyz
-    opacity_logits,  # [N]
-    sh,  # [N, K, 3]
-    sh_bits,  # [N, 3 K] int32, the same memory
-    camera,  # [23] float64: R (9), t (3), fx, fy, cx, cy, centre (3), bounds of x/z and y/z (−x, +x, −y, +y)
-    across,  # tiles per row of tiles
-    down,
-    tiles,  # [4] int64: first column and row of the tiles to draw, and one past the last
-    near,
-    low_pass,
-    alpha_min,
-    antialiased,
-    with_colour,
-    features,  # [N, 16 or 32] out, filled where DRAWN
-    rects,  # [N, 4] int16 out, filled where DRAWN: first column and row of tiles, and one past the last
-    states,  # [N] int8 out: UNUSABLE, HIDDEN or DRAWN
-):
-    """Feature rows of Gaussians lo … hi−1."""
+def project_range(lo, hi, values, camera, tiles, limits, with_colour, features, rects, states):
+    """Feature rows of Gaussians lo … hi−1.
+
+    `values` of them all: means [N, 3], log_scales [N, 3], or [N, 2] for surfels, quats [N, 4] wxyz, opacity_logits [N]
+    and sh [N, K, 3]. `camera` [22] float64: R (9), t (3), fx, fy, cx, cy, width, height, bounds of x/z and y/z (−x, +x,
+    −y, +y). `tiles` [6] int64: first column and row of the tiles to draw, one past the last, how many there are across
+    and down. `limits`: near, low_pass, alpha_min, antialiased. Out: `features` [N, 16 or 32] and `rects` [N, 4] int16
+    (first column and row of tiles, and one past the last), filled where `states` [N] int8 become DRAWN.
+    """
+    means, log_scales, quats, opacity_logits, sh = values
+    near, low_pass, alpha_min, antialiased = limits
     surfels = log_scales.shape[1] == 2
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     s, rows = np.empty(PLANES * CHUNK, np.float64), np.empty(CHUNK, np.int64)
     flat_sh, bands, basis = sh.reshape(-1), sh.shape[1], np.empty(BASIS_PLANES * CHUNK, np.float32)
+    sh_bits = sh.reshape(len(sh), 3 * bands).view(np.int32)
     logit_min = -math.log(max(1.0 / alpha_min - 1.0, 1e-300))
     log2_alpha_min = math.log2(alpha_min)
     reach = 1.001 * math.sqrt(max(-log2_alpha_min, 0.0) / HALF_LOG2E)  # of an opaque one, in standard deviations
@@ -410,28 +301,31 @@ def project_range(
             _surfels(s, n, camera, low_pass, log2_alpha_min)
         else:
             _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased)
-        _emit(s, n, rows, sh_bits, across, down, tiles, log2_alpha_min, surfels, flat, row_size, rects, states)
+        _emit(s, n, rows, sh_bits, tiles, log2_alpha_min, surfels, flat, row_size, rects, states)
         if with_colour:
             sh_basis(s, n, camera, bands, basis)
             _paint(n, rows, basis, bands, flat_sh, flat, row_size, states)
 
 
 @exact_kernel
-def _emit(s, n, rows, sh_bits, across, down, tiles, log2_alpha_min, surfels, flat, row_size, rects, states):
+def _emit(s, n, rows, sh_bits, tiles, log2_alpha_min, surfels, flat, row_size, rects, states):
     """Write the feature rows of the first n staged rows, unless they miss the tiles to draw."""
     for k in range(n):
         i = rows[k]
         x, y = load1(s, OUT_X + k), load1(s, OUT_Y + k)
         half_width, half_height = load1(s, OUT_HALF_WIDTH + k), load1(s, OUT_HALF_HEIGHT + k)
-        x0, x1 = _tile_range(x - half_width, x + half_width, across)
-        y0, y1 = _tile_range(y - half_height, y + half_height, down)
+        x0, x1 = _tile_range(x - half_width, x + half_width, tiles[4])
+        y0, y1 = _tile_range(y - half_height, y + half_height, tiles[5])
         log2_opacity, xx = load1(s, OUT_LOG2 + k), load1(s, OUT_XX + k)
         placed = abs(x) < FAR and abs(y) < FAR and math.isfinite(xx) and log2_opacity > log2_alpha_min
         if not (placed and x0 < x1 and y0 < y1):
             continue
         if x1 <= tiles[0] or x0 >= tiles[2] or y1 <= tiles[1] or y0 >= tiles[3]:
             continue
-        if not _finite_bits(sh_bits, i):
+        largest = int32(0)
+        for j in range(sh_bits.shape[1]):
+            largest = max(largest, sh_bits[i, j] & MAGNITUDE_BITS)
+        if largest >= EXPONENT_BITS:  # NaN or infinity, seen as int32 so that this vectorises
             states[i] = UNUSABLE
             continue
         states[i] = DRAWN

@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from . import cpu
 from .bin import TileLists, tile_lists
 from .blend import TILE_STATE, blend_range
-from .project import DEPTH, ELLIPSE_ROW, SURFEL_ROW
+from .project import DEPTH, Projected
 from .types import Gradients, PictureGradients, RasterSettings, Rendering
 
 SLAB_MARGIN = 0.02  # of the depth: how far active Gaussians may move before layers are made anew
@@ -26,29 +26,23 @@ WORTH_LAYERS = 0.5  # a tile gets layers if its slab holds fewer of its frozen e
 
 
 class CpuPixelRegion:
-    """Wanted pixels of a view over a frozen scene. Not for two threads at once.
+    """See `PixelRegion`. Not for two threads at once.
 
     The layers need no median depth: with the pass `depth`, everything in the tiles is blended every time.
     """
 
     def __init__(
-        self,
-        frozen: Gaussians,
-        camera: Camera,
-        pixels: np.ndarray,  # [H, W] bool: 4×4 blocks around them are drawn, the rest of the pictures is 0
-        settings: RasterSettings,
-        passes: frozenset[str],
+        self, frozen: Gaussians, camera: Camera, pixels: np.ndarray, settings: RasterSettings, passes: frozenset[str]
     ) -> None:
         self.camera, self.settings, self.passes = camera, settings, passes
         self._flags = cpu.pass_flags(passes)
         self._slots, self._wanted = cpu.wanted_tiles(camera, pixels)
-        view = cpu.project(frozen, camera, settings, with_colour=bool(self._flags[0]))
+        view = cpu.project(frozen, camera, settings, self._flags[0])
         self._ignored = view.ignored
-        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=False)
+        lists = tile_lists(view, self._slots, with_records=False)
         rows, entries = np.unique(lists.entries, return_inverse=True)
         self._frozen_count, self._surfels = len(rows), frozen.is_surfels
-        self._features = np.empty((len(rows), view.features.shape[1]), np.float32)
-        self._features[:] = view.features[rows]
+        self._features = view.features[rows]
         self._lists = replace(lists, entries=entries.astype(np.int32).ravel())
         self._depths = np.ascontiguousarray(self._features[self._lists.entries, DEPTH])
         self._shifts = cpu.depth_shifts(self._lists, self._features)
@@ -56,60 +50,34 @@ class CpuPixelRegion:
         self._layered = np.zeros(slots, bool)
         self._near, self._far = np.empty((2, slots), np.float32)  # the slabs of depths that the layers leave out
         self._slab_starts, self._slab_stops = lists.starts.copy(), lists.stops.copy()
-        layered = slots if not self._flags[2] else 0
-        self._front, self._back = (
-            np.empty((layered, TILE_STATE), np.float32),
-            np.empty((layered, TILE_STATE), np.float32),
-        )
+        self._front, self._back = np.empty((2, 0 if self._flags[2] else slots, TILE_STATE), np.float32)
         self._renderings = 0
 
     def render(self, active: Gaussians) -> Rendering:
-        """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
         return self._draw(active, keep=False)[0]
 
     def trace(self, active: Gaussians) -> tuple[Rendering, RegionTrace]:
-        """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
         return self._draw(active, keep=True)
 
     def _draw(self, active: Gaussians, keep: bool) -> tuple[Rendering, RegionTrace]:
         if active.is_surfels != self._surfels:
             raise ValueError("cannot draw 3D Gaussians and surfels together")
         self._renderings += 1
-        view = self._project(active)
-        lists = tile_lists(view.features, view.rects, view.states, self._slots, with_records=keep)
+        frozen, needed = self._frozen_count, self._frozen_count + len(active)
+        if len(self._features) != needed:  # the active ones' rows lie behind the frozen ones'
+            before, self._features = self._features, np.empty((needed, self._features.shape[1]), np.float32)
+            self._features[:frozen] = before[:frozen]
+        drawn = self._features[frozen:]
+        view = cpu.project(active, self.camera, self.settings, self._flags[0], features=drawn)
+        lists = tile_lists(view, self._slots, with_records=keep)
         if len(self._front):
             self._renew_layers(view, lists)
-        merged = self._merge(view, lists)
-        pictures, kept = cpu.blend(
-            active,
-            view,
-            self.camera,
-            self.settings,
-            self._flags,
-            self._features,
-            merged,
-            self._wanted,
-            self._shifts,
-            keep,
-            self._front,
-            self._back,
-        )
-        return cpu.as_rendering(pictures, self.camera, self._ignored + view.ignored), RegionTrace(
-            self, self._renderings, kept
-        )
+        given = self._flags, self._merge(view, lists), self._features, self._wanted, self._shifts, self._back
+        picture, kept = cpu.blend(cpu.Trace(active, view, self.camera, self.settings, *given), keep, self._front)
+        picture = replace(picture, ignored=self._ignored + picture.ignored)
+        return picture, RegionTrace(self, self._renderings, kept)
 
-    def _project(self, active: Gaussians) -> cpu.Projected:
-        """Project the active Gaussians into feature rows behind the frozen ones."""
-        needed = self._frozen_count + len(active)
-        if len(self._features) != needed:
-            before = self._features
-            self._features = np.empty((needed, SURFEL_ROW if self._surfels else ELLIPSE_ROW), np.float32)
-            self._features[: self._frozen_count] = before[: self._frozen_count]
-        n = len(active)
-        out = cpu.Projected(self._features[self._frozen_count :], np.empty((n, 4), np.int16), np.empty(n, np.int8))
-        return cpu.project(active, self.camera, self.settings, bool(self._flags[0]), out)
-
-    def _renew_layers(self, view: cpu.Projected, lists: TileLists) -> None:
+    def _renew_layers(self, view: Projected, lists: TileLists) -> None:
         """Make the layers of tiles whose active Gaussians have left the slab of depths that they were made for."""
         filled = np.flatnonzero(lists.stops > lists.starts)
         near, far = np.full((2, len(lists.tiles)), np.nan, np.float32)
@@ -134,49 +102,23 @@ class CpuPixelRegion:
     def _layer(self, slots: np.ndarray, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
         """The state of the slots' tiles after a part of their frozen entries, [·, TILE_STATE]."""
         states = np.empty((len(slots), TILE_STATE), np.float32)
-        cpu.over_tiles(
-            blend_range,
-            replace(self._lists, tiles=self._lists.tiles[slots], starts=starts, stops=stops),
-            self.camera,
-            self._features,
-            self._surfels,
-            cpu.pack_limits(self.settings),
-            self._shifts[slots],
-            self._flags,
-            self._wanted[slots],
-            cpu.NO_STATES,
-            cpu.NO_MASKS,
-            cpu.NO_MASKS,
-            np.empty(len(slots), np.int64),
-            states,
-            np.zeros(3, np.float32),
-            cpu.NO_STATES,
-            cpu.NO_PICTURES,
-        )
+        lists = replace(self._lists, tiles=self._lists.tiles[slots], starts=starts, stops=stops)
+        how = self._features, self._surfels, cpu.pack_limits(self.settings), self._wanted[slots], self._shifts[slots]
+        given = *how, np.zeros(3, np.float32), cpu.NO_STATES
+        kept = cpu.NO_MASKS, cpu.NO_MASKS, np.empty(len(slots), np.int64), states
+        cpu.over_tiles(blend_range, lists, self.camera, given, kept, self._flags, cpu.NO_STATES, cpu.NO_PICTURES)
         return states
 
-    def _merge(self, view: cpu.Projected, lists: TileLists) -> TileLists:
+    def _merge(self, view: Projected, lists: TileLists) -> TileLists:
         """Frozen entries of the slabs and active ones in one list, by depth, frozen first where that is equal."""
         counts = (self._slab_stops - self._slab_starts) + (lists.stops - lists.starts)
         stops = np.cumsum(counts)
-        entries = np.empty(int(counts.sum()), np.int32)
+        starts, entries = stops - counts, np.empty(int(counts.sum()), np.int32)
         records = np.empty(len(entries) if len(lists.records) else 0, np.int64)
-        _merge_lists(
-            self._slab_starts,
-            self._slab_stops,
-            self._lists.entries,
-            self._depths,
-            lists.starts,
-            lists.stops,
-            lists.entries,
-            view.features,
-            lists.records,
-            self._frozen_count,
-            stops - counts,
-            entries,
-            records,
-        )
-        return TileLists(lists.tiles, stops - counts, stops, entries, records, lists.spans)
+        frozen = self._slab_starts, self._slab_stops, self._lists.entries, self._depths
+        active = lists.starts, lists.stops, lists.entries, lists.records, view.features
+        _merge_lists(frozen, active, self._frozen_count, starts, entries, records)
+        return TileLists(lists.tiles, starts, stops, entries, records, lists.spans)
 
 
 @dataclass(frozen=True)
@@ -188,13 +130,8 @@ class RegionTrace:
     traced: cpu.Trace
 
     def backward(self, gradients: PictureGradients) -> Gradients:
-        """The gradient with respect to the active Gaussians.
-
-        Raises
-        ------
-        RuntimeError
-            If the region has been rendered again: its rows are those of the later rendering.
-        """
+        """The gradient with respect to the active Gaussians; a RuntimeError if the region has been rendered again, as
+        its rows are those of the later rendering."""
         if self.region._renderings != self.rendering:
             raise RuntimeError("backward: the region has been rendered again since")
         return self.traced.backward(gradients)
@@ -214,15 +151,13 @@ def _find_slabs(depths, starts, stops, near, far, slab_starts, slab_stops):
 
 
 @exact_kernel
-def _merge_lists(
-    a_starts, a_stops, a_entries, a_depths, b_starts, b_stops, b_entries, b_features, b_records, offset, starts,
-    entries, records,
-):  # fmt: skip
+def _merge_lists(frozen, active, offset, starts, entries, records):
+    a_starts, a_stops, a_entries, a_depths = frozen
+    b_starts, b_stops, b_entries, b_records, b_features = active
     for s in range(len(starts)):
         a, b = a_starts[s], b_starts[s]
         for place in range(starts[s], starts[s] + a_stops[s] - a + b_stops[s] - b):
-            in_front = a < a_stops[s] and (b == b_stops[s] or a_depths[a] <= b_features[b_entries[b], DEPTH])
-            if in_front:
+            if a < a_stops[s] and (b == b_stops[s] or a_depths[a] <= b_features[b_entries[b], DEPTH]):
                 entries[place] = a_entries[a]
                 a += 1
             else:

@@ -15,27 +15,19 @@ from numba import float64, int64
 
 from ..compute.exp_log import exp64
 from ..compute.jit import exact_kernel
-from .project import rotation
+from .staging import rotation, to_camera
 
 REACH = 3.0  # standard deviations from its centre, along z, within which a Gaussian is met
 
 
 @exact_kernel
-def meet_range(
-    lo,
-    hi,
-    numbers,  # [H, W] int32: 1 + the Gaussian that the pixel shows, 0 for none
-    means,  # [N, 3]
-    log_scales,  # [N, 3]
-    quats,  # [N, 4]
-    camera,  # [23] as project_range reads it
-    low_pass,  # px²
-    depth,  # [H, W] float32 out
-):
-    """z at which the rays of rows lo … hi−1 pass through the most of their Gaussian."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = (
-        camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8],
-    )  # fmt: skip
+def meet_range(lo, hi, numbers, means, log_scales, quats, camera, low_pass, depth):
+    """z at which the rays of rows lo … hi−1 pass through the most of their Gaussian: `depth` [H, W] float32, out.
+
+    `numbers` [H, W] int32: 1 + the Gaussian that the pixel shows, 0 for none; `low_pass` in px²; the others as for
+    project_range.
+    """
+    r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     axes = np.empty((3, 5))  # of the Gaussian met last: direction, the centre along it, 1 / variance
     met, z, reach, flatness = int64(-1), 0.0, 0.0, 0.0
@@ -48,17 +40,15 @@ def meet_range(
             if i != met:  # neighbours mostly show the same one
                 met = i
                 mx, my, mz = float64(means[i, 0]), float64(means[i, 1]), float64(means[i, 2])
-                x = r00 * mx + r01 * my + r02 * mz + camera[9]
-                y = r10 * mx + r11 * my + r12 * mz + camera[10]
-                z = r20 * mx + r21 * my + r22 * mz + camera[11]
+                x, y, z = to_camera(r, mx, my, mz)
+                x, y, z = x + camera[9], y + camera[10], z + camera[11]
                 q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(
                     float64(quats[i, 0]), float64(quats[i, 1]), float64(quats[i, 2]), float64(quats[i, 3])
                 )
                 blur = low_pass * z * z / (fx * fy)  # the low-pass as a ball: what is thinner than a pixel has no slope
                 spread, least, most, total = 0.0, math.inf, 0.0, 0.0  # the last three: variances along the axes
                 for k, (a0, a1, a2) in enumerate(((q00, q10, q20), (q01, q11, q21), (q02, q12, q22))):
-                    ax, ay = r00 * a0 + r01 * a1 + r02 * a2, r10 * a0 + r11 * a1 + r12 * a2
-                    az = r20 * a0 + r21 * a1 + r22 * a2
+                    ax, ay, az = to_camera(r, a0, a1, a2)
                     variance = exp64(2.0 * float64(log_scales[i, k])) + blur
                     axes[k, 0], axes[k, 1], axes[k, 2], axes[k, 3] = ax, ay, az, ax * x + ay * y + az * z
                     axes[k, 4] = 1.0 / variance

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ..geometry import Window as Window
 
+Mask = np.ndarray | None  # bool, of a picture's pixels [H, W] or a scene's rows [N]; None: all
 PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal", "distortion"})
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})  # what a picture usually needs
 
@@ -39,16 +41,20 @@ class Rendering:
     ignored: int  # rows that cannot be drawn: broken geometry, or in the picture with broken SH coefficients
 
 
+def _nothing(*channels: int) -> Any:
+    return field(default_factory=lambda: np.empty((0, 0, *channels), np.float32))
+
+
 @dataclass(frozen=True)
 class PictureGradients:
     """The gradient of a loss with respect to a Rendering; what is empty is zero. Shapes as there, float32."""
 
-    rgb: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
-    alpha: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    expected_depth: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    median_depth: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    normals: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 3), np.float32))
-    distortion: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    rgb: np.ndarray = _nothing(3)
+    alpha: np.ndarray = _nothing()
+    expected_depth: np.ndarray = _nothing()
+    median_depth: np.ndarray = _nothing()
+    normals: np.ndarray = _nothing(3)
+    distortion: np.ndarray = _nothing()
 
 
 @dataclass(frozen=True)

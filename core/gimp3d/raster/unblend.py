@@ -9,7 +9,7 @@ where v is a Gaussian's value under the pixel's gradient. The walk repeats forwa
 from __future__ import annotations
 
 import numpy as np
-from numba import float32, int64, uint64
+from numba import float32, int64
 
 from ..compute.exp_log import LN2
 from ..compute.jit import exact_kernel, inline_kernel
@@ -18,11 +18,9 @@ from ..compute.simd import (
     fma16,
     load16,
     load_block,
-    load_block_x,
-    load_block_y,
-    load_block_z,
-    lowest_bit,
+    load_block3,
     max16,
+    next_bit,
     prefetch,
     rows16,
     splat16,
@@ -57,12 +55,6 @@ from .blend import (
 from .project import HALF, TILE, ZERO, ellipse_of, shown_of, surfel_of
 
 RECORD = 16
-# A 3D Gaussian's record: sums over pixels. p is the gradient with respect to ln alpha, (dx, dy) the offset from its
-# centre. A surfel's record has the same first four, p in LOG_ALPHA, and after it the gradients of U, V, A and CENTRE.
-D_RED, D_GREEN, D_BLUE, D_DEPTH, LOG_ALPHA = range(5)
-P_X, P_Y, P_XX, P_XY, P_YY = range(5, 10)
-D_U_X, D_U_Y, D_V_X, D_V_Y, D_A_X, D_A_Y, D_CENTRE_X, D_CENTRE_Y = range(5, 13)
-D_NORMAL_X, D_NORMAL_Y, D_NORMAL_Z = 13, 14, 15
 
 # Planes of a block on the way back: T, which is 0 until a closed pixel is opened again; what lies behind, now and at
 # the START; gradients with respect to the sums of the same name and the sum of weights; the median's, and its entry.
@@ -72,42 +64,22 @@ TWICE_LN2, TWO = np.float32(2 * LN2), np.float32(2)
 
 
 @exact_kernel
-def unblend_range(
-    lo,
-    hi,
-    order,  # [S] slots in the order in which they are done
-    tiles,  # [S]
-    across,
-    width,  # of the pictures
-    starts,  # [S]
-    stops,  # [S]
-    entries,  # [P]
-    features,  # [N, 16 or 32]
-    surfels,
-    limits,  # [6] float32, as blend_range
-    shifts,  # [S]
-    flags,  # [5] bool: gradients of rgb, expected depth, median depth, normals, distortion are given
-    wanted,  # [S] uint64
-    masks,  # [P] uint64
-    closings,  # uint64
-    ends,  # [S]
-    states,  # [S, TILE_STATE] what blend_range left
-    background,  # [3]
-    back,  # [S, TILE_STATE] or empty
-    gradients,  # (rgb, alpha, expected, median, normals, distortion) flat as blend_range's pictures, empty if not given
-    first_active,  # rows below are frozen: they get no record
-    record_rows,  # [P] int64
-    records,  # [Q · 16] out
-):
-    """Records of the slots order[lo:hi]."""
-    alpha_min, alpha_max = limits[0], limits[1]
-    near, disc, distortion_near = limits[3], limits[4], limits[5]
-    with_rgb, with_depth, with_median, with_normals, with_distortion = flags[0], flags[1], flags[2], flags[3], flags[4]
+def unblend_range(slots, lists, given, kept, flags, gradients, first_active, record_rows, records):
+    """Records [Q · 16] of some slots' entries: row record_rows[i] for entry i [P], none for rows below `first_active`,
+    which are frozen.
+
+    `lists` and `given` are those of blend_range, `kept` is what it left; `gradients` lie as its pictures do, empty
+    where not given; `flags` [5] bool: which of rgb, expected depth, median depth, normals and distortion are.
+    """
+    tiles, across, width, starts, stops, entries = lists
+    features, surfels, limits, wanted, shifts, background, back = given
+    masks, closings, ends, states = kept
+    _, alpha_max, _, _, disc, distortion_near = limits
+    with_rgb, with_depth, with_median, with_normals, with_distortion = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     work = aligned_empty(BLOCKS * BACK_STATE)
-    for j in range(lo, hi):
-        slot = order[j]
+    for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state, shift = states[slot], shifts[slot]
         disparity_shift = distortion_near / shift
@@ -129,20 +101,16 @@ def unblend_range(
             s_red, s_green, s_blue, s_depth, s_log = none, none, none, none, none
             s_nx, s_ny, s_nz = none, none, none
             if surfels:
-                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel_of(flat, o)
+                surfel = surfel_of(flat, o)
+                x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 disparity = distortion_near / depth
                 s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy = none, none, none, none, none, none, none, none
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BACK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
-                    den = fma16(dx, a_x, fma16(dy, a_y, one))
-                    free, alpha, inverse, blurred = surfel_alpha(
-                        u, v, den, dx, dy, log2_opacity, depth, near, disc, alpha_min, alpha_max
-                    )
+                    u, v, den, free, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     z = where_greater(blurred, ZERO, splat16(depth), inverse * depth) - shift
                     m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                     value = load16(work, k + G_W)
@@ -199,13 +167,11 @@ def unblend_range(
                 z, m = splat16(depth - shift), splat16(disparity - disparity_shift)
                 q, q_x, q_y, q_xx, q_xy, q_yy, s_m = none, none, none, none, none, none, none
                 while mask:
-                    b = lowest_bit(mask)
-                    mask &= mask - uint64(1)
+                    b, mask = next_bit(mask)
                     k = b * BACK_STATE
                     dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
-                    free, alpha = ellipse_alpha(
-                        along0 + (dx * xx + dy * xy), down0 + dy * yy, log2_opacity, alpha_min, alpha_max
-                    )
+                    along, down = along0 + (dx * xx + dy * xy), down0 + dy * yy
+                    free, alpha = ellipse_alpha(along, down, log2_opacity, limits)
                     value = load16(work, k + G_W)
                     if with_rgb:
                         value = _three(work, k, G_R, red, green, blue, value)
@@ -285,8 +251,7 @@ def _median_gradient(work, k, number):
 def _reopen(state, work, mask, entry):
     """Pixels that were closed after this many entries take part from here on."""
     while mask:
-        b = lowest_bit(mask)
-        mask &= mask - uint64(1)
+        b, mask = next_bit(mask)
         k, w = b * BLOCK_STATE, b * BACK_STATE
         closed = load16(state, k + CLOSED)
         store16(work, w + T, where_equal(closed, entry, load16(state, k + HELD), load16(work, w + T)))
@@ -298,8 +263,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
     """The pixels' gradients with respect to the sums over Gaussians, from those of the pictures."""
     d_rgb, d_alpha, d_expected, d_median, d_normals, d_distortion = gradients
     while mask:
-        b = lowest_bit(mask)
-        mask &= mask - uint64(1)
+        b, mask = next_bit(mask)
         k, w = b * BLOCK_STATE, b * BACK_STATE
         o = (top + BLOCK * (b >> 3)) * width + left + BLOCK * (b & 7)
         clear = load16(state, k + T) + load16(state, k + HELD)
@@ -311,9 +275,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
             g_w = load_block(d_alpha, o, width)
         behind = splat16(ZERO)  # what shows where no Gaussian is left
         if flags[0]:
-            g_red = load_block_x(d_rgb, 3 * o, 3 * width)
-            g_green = load_block_y(d_rgb, 3 * o, 3 * width)
-            g_blue = load_block_z(d_rgb, 3 * o, 3 * width)
+            g_red, g_green, g_blue = load_block3(d_rgb, 3 * o, 3 * width)
             behind = fma16(g_red, background[0], fma16(g_green, background[1], g_blue * background[2]))
             store16(work, w + G_R, g_red)
             store16(work, w + G_G, g_green)
@@ -326,9 +288,7 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
         if flags[3]:
             nx, ny, nz, inverse = total_normal(state, back, slot, k, clear)
             nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
-            g_x = load_block_x(d_normals, 3 * o, 3 * width)
-            g_y = load_block_y(d_normals, 3 * o, 3 * width)
-            g_n = load_block_z(d_normals, 3 * o, 3 * width)
+            g_x, g_y, g_n = load_block3(d_normals, 3 * o, 3 * width)
             along = fma16(g_x, nx, fma16(g_y, ny, g_n * nz))
             store16(work, w + G_NX, (g_x - along * nx) * inverse)
             store16(work, w + G_NY, (g_y - along * ny) * inverse)

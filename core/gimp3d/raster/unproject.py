@@ -13,94 +13,33 @@ from numba import float32, float64
 from ..compute.exp_log import exp64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import load1, load16, prefetch, splat16, store1, store16
-from .project import (
-    BASIS_PLANES,
-    BLUE,
-    C1,
-    C2,
-    C3,
-    CHUNK,
-    DRAWN,
-    EDGE_ON,
-    FOUR,
-    GREEN,
-    HALF_LOG2E,
-    LOGIT,
-    RED,
-    S0,
-    S1,
-    S2,
-    SH_X,
-    SH_Y,
-    SH_Z,
-    THREE,
-    TWO,
-    ZERO,
-    X,
-    Y,
-    Z,
-    load_quat,
-    rotation,
-    sh_basis,
-    stage,
-    to_camera,
-)
-from .unblend import (
-    D_A_X,
-    D_A_Y,
-    D_BLUE,
-    D_CENTRE_X,
-    D_CENTRE_Y,
-    D_DEPTH,
-    D_GREEN,
-    D_NORMAL_X,
-    D_NORMAL_Y,
-    D_NORMAL_Z,
-    D_RED,
-    D_U_X,
-    D_U_Y,
-    D_V_X,
-    D_V_Y,
-    LOG_ALPHA,
-    P_X,
-    P_XX,
-    P_XY,
-    P_Y,
-    P_YY,
-    RECORD,
-)
+from .harmonics import BASIS_PLANES, C1, C2, C3, FOUR, SH_X, THREE, TWO, sh_basis
+from .project import BLUE, DRAWN, EDGE_ON, GREEN, HALF_LOG2E, RED, ZERO
+from .staging import CHUNK, LOGIT, QW, S0, S1, STAGED, X, facing_normal, load3, rotation_of, stage, store3, to_camera
+from .unblend import RECORD
 
+# Records' sums in the order in which unblend_range leaves them. A 3D Gaussian's are over pixels: p is the gradient with
+# respect to ln alpha, (dx, dy) the offset from its centre. A surfel's have the same first four, p in LOG_ALPHA, and
+# after it the gradients of U, V, A and CENTRE.
+D_RED, D_GREEN, D_BLUE, D_DEPTH, LOG_ALPHA = range(5)
+P_X, P_Y, P_XX, P_XY, P_YY = range(5, 10)
+D_U_X, D_U_Y, D_V_X, D_V_Y, D_A_X, D_A_Y, D_CENTRE_X, D_CENTRE_Y = range(5, 13)
+D_NORMAL_X = 13  # the first of three
 SIX, EIGHT = np.float32(6), np.float32(8)
 AHEAD = 16  # Gaussians whose records to prefetch: tiles left them all over the memory
 # Scratch planes after those of what is staged: a record's sums, then the gradients
-SUMS = 11 * CHUNK
 D_MEAN, D_SCALE, D_QUAT, D_LOGIT = 27 * CHUNK, 30 * CHUNK, 33 * CHUNK, 37 * CHUNK
 PLANES = 38
 
 
 @exact_kernel
-def unproject_range(
-    lo,
-    hi,
-    means,  # [N, 3]
-    log_scales,  # [N, 3 or 2]
-    quats,  # [N, 4]
-    opacity_logits,  # [N]
-    sh,  # [N, K, 3]
-    camera,  # [23] float64, as project_range
-    low_pass,
-    antialiased,
-    features,  # [N, 16 or 32]
-    states,  # [N] int8
-    spans,  # [N, 2] int64
-    records,  # [Q · 16]
-    d_means,  # [N, 3] out
-    d_log_scales,  # [N, 3 or 2] out
-    d_quats,  # [N, 4] out
-    d_opacity_logits,  # [N] out
-    d_sh,  # [N, K, 3] out
-):
-    """Gradients of Gaussians lo … hi−1."""
+def unproject_range(lo, hi, values, camera, low_pass, antialiased, features, states, spans, records, gradients):
+    """Gradients of Gaussians lo … hi−1, one array for each of `values`, zero on entry.
+
+    The records [Q · 16] of Gaussian g are those from spans[g, 0] to spans[g, 1] − 1; the rest is as for project_range.
+    """
+    means, log_scales, quats, opacity_logits, sh = values
+    d_means, d_log_scales, d_quats, d_opacity_logits, d_sh = gradients
     scale_count, bands = log_scales.shape[1], sh.shape[1]
     flat_sh, flat_d_sh = sh.reshape(-1), d_sh.reshape(-1)
     s, rows, sums = np.empty(PLANES * CHUNK, np.float64), np.empty(CHUNK, np.int64), np.empty(RECORD, np.float32)
@@ -116,20 +55,10 @@ def unproject_range(
                     total = total + load16(records, r * RECORD)
                 store16(sums, 0, total)
                 for j in range(RECORD):
-                    store1(s, SUMS + j * CHUNK + n, float64(sums[j]))
+                    store1(s, STAGED + j * CHUNK + n, float64(sums[j]))
                 stage(s, n, i, means, log_scales, quats, opacity_logits, camera)
                 rows[n] = i
                 n += 1
-            else:
-                for k in range(3):
-                    d_means[i, k] = ZERO
-                for k in range(scale_count):
-                    d_log_scales[i, k] = ZERO
-                for k in range(4):
-                    d_quats[i, k] = ZERO
-                d_opacity_logits[i] = ZERO
-                for k in range(3 * bands):
-                    store1(flat_d_sh, i * 3 * bands + k, ZERO)
             i += 1
         if scale_count == 2:
             _surfels_back(s, n, camera)
@@ -151,18 +80,14 @@ def unproject_range(
 
 @inline_kernel
 def _to_world(r, x, y, z):
-    """A direction in camera axes in the world's, r: the rows of the camera's rotation."""
-    return (
-        r[0] * x + r[3] * y + r[6] * z,
-        r[1] * x + r[4] * y + r[7] * z,
-        r[2] * x + r[5] * y + r[8] * z,
-    )
+    """The inverse of to_camera."""
+    return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
 
 
 @inline_kernel
 def _pull_rotation(s, k, e00, e01, e02, e10, e11, e12, e20, e21, e22):
     """From the gradient with respect to the rotation matrix to that of the raw quaternion (normal to it)."""
-    w, x, y, z = load_quat(s, k)
+    w, (x, y, z) = load1(s, QW + k), load3(s, QW + CHUNK, k)
     inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     gw = 2.0 * (x * (e21 - e12) + y * (e02 - e20) + z * (e10 - e01))
@@ -171,9 +96,7 @@ def _pull_rotation(s, k, e00, e01, e02, e10, e11, e12, e20, e21, e22):
     gz = 2.0 * (x * (e02 + e20) + y * (e12 + e21) + w * (e10 - e01) - 2.0 * z * (e00 + e11))
     along = gw * w + gx * x + gy * y + gz * z
     store1(s, D_QUAT + k, (gw - along * w) * inverse)
-    store1(s, D_QUAT + 1 * CHUNK + k, (gx - along * x) * inverse)
-    store1(s, D_QUAT + 2 * CHUNK + k, (gy - along * y) * inverse)
-    store1(s, D_QUAT + 3 * CHUNK + k, (gz - along * z) * inverse)
+    store3(s, D_QUAT + CHUNK, k, (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse)
 
 
 @exact_kernel
@@ -182,10 +105,10 @@ def _ellipses_back(s, n, camera, low_pass, antialiased):
     # in locals, or else every store might have changed them, and nothing would vectorise
     r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = r
-    left, right, top, bottom = camera[19], camera[20], camera[21], camera[22]
+    left, right, top, bottom = camera[18], camera[19], camera[20], camera[21]
     fx, fy = camera[12], camera[13]
     for k in range(n):
-        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
+        x, y, z = load3(s, X, k)
         iz = 1.0 / z
         tan_x, tan_y = x * iz, y * iz
         bent_x, bent_y = min(max(tan_x, left), right), min(max(tan_y, top), bottom)
@@ -193,9 +116,10 @@ def _ellipses_back(s, n, camera, low_pass, antialiased):
         j02, j12 = -j00 * bent_x, -j11 * bent_y
         a0, a1, a2 = j00 * r00 + j02 * r20, j00 * r01 + j02 * r21, j00 * r02 + j02 * r22
         b0, b1, b2 = j11 * r10 + j12 * r20, j11 * r11 + j12 * r21, j11 * r12 + j12 * r22
-        qw, qx, qy, qz = load_quat(s, k)
-        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
-        s0, s1, s2 = exp64(load1(s, S0 + k)), exp64(load1(s, S1 + k)), exp64(load1(s, S2 + k))
+        q = rotation_of(s, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = q
+        s0, s1, s2 = load3(s, S0, k)
+        s0, s1, s2 = exp64(s0), exp64(s1), exp64(s2)
         u0, v0 = (a0 * q00 + a1 * q10 + a2 * q20) * s0, (b0 * q00 + b1 * q10 + b2 * q20) * s0
         u1, v1 = (a0 * q01 + a1 * q11 + a2 * q21) * s1, (b0 * q01 + b1 * q11 + b2 * q21) * s1
         u2, v2 = (a0 * q02 + a1 * q12 + a2 * q22) * s2, (b0 * q02 + b1 * q12 + b2 * q22) * s2
@@ -235,21 +159,15 @@ def _ellipses_back(s, n, camera, low_pass, antialiased):
             d_s0 += c * h0 - p * (low_pass * (u0 * u0 + v0 * v0) + h0) / det
             d_s1 += c * h1 - p * (low_pass * (u1 * u1 + v1 * v1) + h1) / det
             d_s2 += c * h2 - p * (low_pass * (u2 * u2 + v2 * v2) + h2) / det
-        store1(s, D_SCALE + k, d_s0)
-        store1(s, D_SCALE + CHUNK + k, d_s1)
-        store1(s, D_SCALE + 2 * CHUNK + k, d_s2)
+        store3(s, D_SCALE, k, d_s0, d_s1, d_s2)
         du0, du1, du2, dv0, dv1, dv2 = du0 * s0, du1 * s1, du2 * s2, dv0 * s0, dv1 * s1, dv2 * s2
         e00, e01, e02 = a0 * du0 + b0 * dv0, a0 * du1 + b0 * dv1, a0 * du2 + b0 * dv2
         e10, e11, e12 = a1 * du0 + b1 * dv0, a1 * du1 + b1 * dv1, a1 * du2 + b1 * dv2
         e20, e21, e22 = a2 * du0 + b2 * dv0, a2 * du1 + b2 * dv1, a2 * du2 + b2 * dv2
         # the normal: the flattest column of Q in camera axes, facing the camera
-        gx, gy, gz = _to_world(r, _sum(s, D_NORMAL_X, k), _sum(s, D_NORMAL_Y, k), _sum(s, D_NORMAL_Z, k))
-        third, first = (s2 <= s0) & (s2 <= s1), s0 <= s1
-        wx = q02 if third else (q00 if first else q01)
-        wy = q12 if third else (q10 if first else q11)
-        wz = q22 if third else (q20 if first else q21)
-        nx, ny, nz = to_camera(r, wx, wy, wz)
-        facing = -1.0 if nx * x + ny * y + nz * z > 0.0 else 1.0
+        gx, gy, gz = load3(s, STAGED + D_NORMAL_X * CHUNK, k)
+        gx, gy, gz = _to_world(r, gx, gy, gz)
+        _, _, _, third, first, facing = facing_normal(r, q, s0, s1, s2, x, y, z)
         to_third = facing if third else 0.0
         to_first = (0.0 if third else facing) if first else 0.0
         to_second = facing - to_third - to_first
@@ -278,9 +196,8 @@ def _surfels_back(s, n, camera):
     r = (camera[0], camera[1], camera[2], camera[3], camera[4], camera[5], camera[6], camera[7], camera[8])
     fx, fy = camera[12], camera[13]
     for k in range(n):
-        x, y, z = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
-        qw, qx, qy, qz = load_quat(s, k)
-        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation(qw, qx, qy, qz)
+        x, y, z = load3(s, X, k)
+        q00, q01, q02, q10, q11, q12, q20, q21, q22 = rotation_of(s, k)
         tx, ty, tz = to_camera(r, q00, q10, q20)
         bx, by, bz = to_camera(r, q01, q11, q21)
         nx, ny, nz = to_camera(r, q02, q12, q22)
@@ -298,10 +215,8 @@ def _surfels_back(s, n, camera):
         store1(s, D_SCALE + k, -(gux * (z * tx / fx - a_x * along_u) + guy * (z * ty / fy - a_y * along_u)))
         store1(s, D_SCALE + CHUNK + k, -(gvx * (z * bx / fx - a_x * along_v) + gvy * (z * by / fy - a_y * along_v)))
         d_along_u, d_along_v = -(gux * a_x + guy * a_y), -(gvx * a_x + gvy * a_y)
-        d_ax, d_ay = (
-            _sum(s, D_A_X, k) - gux * along_u - gvx * along_v,
-            _sum(s, D_A_Y, k) - guy * along_u - gvy * along_v,
-        )
+        d_ax = _sum(s, D_A_X, k) - gux * along_u - gvx * along_v
+        d_ay = _sum(s, D_A_Y, k) - guy * along_u - gvy * along_v
         # A = slope (nx/fx, ny/fy), slope = z / plane, plane = n·c
         d_slope = d_ax * nx / fx + d_ay * ny / fy
         d_plane = -d_slope * slope * inverse
@@ -316,27 +231,22 @@ def _surfels_back(s, n, camera):
         facing = -1.0 if plane > 0.0 else 1.0
         e00, e10, e20 = _to_world(r, gux * z / fx + d_along_u * x, guy * z / fy + d_along_u * y, d_along_u * z)
         e01, e11, e21 = _to_world(r, gvx * z / fx + d_along_v * x, gvy * z / fy + d_along_v * y, d_along_v * z)
-        e02, e12, e22 = _to_world(
-            r,
-            d_ax / fx + d_plane * x + facing * _sum(s, D_NORMAL_X, k),
-            d_ay / fy + d_plane * y + facing * _sum(s, D_NORMAL_Y, k),
-            d_plane * z + facing * _sum(s, D_NORMAL_Z, k),
-        )
+        sx, sy, sz = load3(s, STAGED + D_NORMAL_X * CHUNK, k)
+        sx, sy = d_ax / fx + d_plane * x + facing * sx, d_ay / fy + d_plane * y + facing * sy
+        e02, e12, e22 = _to_world(r, sx, sy, d_plane * z + facing * sz)
         _pull_rotation(s, k, e00, e01, e02, e10, e11, e12, e20, e21, e22)
 
 
 @inline_kernel
 def _sum(s, j, k):
     """Sum j of the record of staged Gaussian k."""
-    return load1(s, SUMS + j * CHUNK + k)
+    return load1(s, STAGED + j * CHUNK + k)
 
 
 @inline_kernel
 def _store_mean(s, k, r, x, y, z):
     x, y, z = _to_world(r, x, y, z)
-    store1(s, D_MEAN + k, x)
-    store1(s, D_MEAN + CHUNK + k, y)
-    store1(s, D_MEAN + 2 * CHUNK + k, z)
+    store3(s, D_MEAN, k, x, y, z)
 
 
 @exact_kernel
@@ -363,7 +273,7 @@ def _colours_back(s, n, rows, basis, bands, camera, flat_sh, features, flat_d_sh
             store1(flat_d_sh, o + 3 * band + 2, y * blue)
         if bands == 1:
             continue
-        x, y, z = load1(basis, SH_X + k), load1(basis, SH_Y + k), load1(basis, SH_Z + k)
+        x, y, z = load3(basis, SH_X, k)
         # h: each band's coefficients under the colour's gradient, with the band's factor
         gx = -C1 * _dot(flat_sh, o + 9, red, green, blue)
         gy = -C1 * _dot(flat_sh, o + 3, red, green, blue)
@@ -392,12 +302,12 @@ def _colours_back(s, n, rows, basis, bands, camera, flat_sh, features, flat_d_sh
                 gy -= TWO * x * y * h13 + TWO * y * z * h14 + SIX * x * y * h15
                 gz += x * y * h10 + EIGHT * y * z * h11 + (SIX * zz - THREE * (xx + yy)) * h12
                 gz += EIGHT * x * z * h13 + (xx - yy) * h14
-        px, py, pz = load1(s, X + k), load1(s, Y + k), load1(s, Z + k)
+        px, py, pz = load3(s, X, k)
         inverse = 1.0 / math.sqrt(px * px + py * py + pz * pz)
         along = gx * x + gy * y + gz * z
-        store1(s, D_MEAN + k, load1(s, D_MEAN + k) + (gx - along * x) * inverse)
-        store1(s, D_MEAN + CHUNK + k, load1(s, D_MEAN + CHUNK + k) + (gy - along * y) * inverse)
-        store1(s, D_MEAN + 2 * CHUNK + k, load1(s, D_MEAN + 2 * CHUNK + k) + (gz - along * z) * inverse)
+        mx, my, mz = load3(s, D_MEAN, k)
+        mx, my, mz = mx + (gx - along * x) * inverse, my + (gy - along * y) * inverse, mz + (gz - along * z) * inverse
+        store3(s, D_MEAN, k, mx, my, mz)
 
 
 @inline_kernel

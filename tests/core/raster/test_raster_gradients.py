@@ -103,7 +103,7 @@ def pairs_in_use(traced: Trace, count: int) -> np.ndarray:
     used = np.ones((camera.height, camera.width, count), bool)
     across = -(-camera.width // TILE)
     for slot, tile in enumerate(lists.tiles):
-        planes = traced.states[slot].reshape(TILE // BLOCK, TILE // BLOCK, BLOCK_STATE // 16, BLOCK, BLOCK)
+        planes = traced.kept[3][slot].reshape(TILE // BLOCK, TILE // BLOCK, BLOCK_STATE // 16, BLOCK, BLOCK)
         closed = np.where(planes[:, :, HELD // 16] > 0, planes[:, :, CLOSED // 16], np.inf)
         closed = closed.transpose(0, 2, 1, 3).reshape(TILE, TILE)  # the number of entries that a pixel took
         top, left = tile // across * TILE, tile % across * TILE
