@@ -122,13 +122,10 @@ def find_growth(
     return Growth(found, (*region[:least], holding[least], *region[least + 1 :]), holding[least])
 
 
-def _likelihood(
-    colours: np.ndarray,  # [M, 3] in [0, 1]
-    weights: np.ndarray,  # [M]
-    object_: np.ndarray,  # [M] bool, what is the object's for sure
-    surface: np.ndarray,  # [M] bool, what is mostly surface
-) -> np.ndarray:
-    """[M]: the probability by colour that a Gaussian is the object's, from smoothed histograms of both."""
+def _likelihood(colours: np.ndarray, weights: np.ndarray, object_: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """[M]: the probability by colour [M, 3] in [0, 1] that a Gaussian is the object's, from smoothed histograms,
+    weighted [M], of what is the object's for sure and what is mostly surface, [M] bool each.
+    """
     index = np.minimum(colours * BINS, BINS - 1).astype(int) @ np.array([BINS * BINS, BINS, 1])
 
     def density(rows: np.ndarray) -> np.ndarray:

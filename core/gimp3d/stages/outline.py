@@ -13,12 +13,8 @@ from ..geometry import Window, window_round
 EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
 
 
-def box_polygon(
-    box: Box,
-    camera: Camera,
-    near: float,  # z below which the box is cut away, scene units
-) -> np.ndarray | None:
-    """The convex outline of a box in a view, [M, 2] pixels, clipped against the near plane before projecting.
+def box_polygon(box: Box, camera: Camera, near: float) -> np.ndarray | None:
+    """The convex outline of a box in a view, [M, 2] pixels, cut away at z below `near` (scene units) before projecting.
 
     None if nothing of the box lies in front of the camera.
     """
@@ -37,12 +33,8 @@ def box_polygon(
     return hull if len(hull) >= 3 else None
 
 
-def fill_polygon(
-    polygon: np.ndarray,  # [M, 2] convex, pixels
-    width: int,
-    height: int,
-) -> np.ndarray:
-    """[H, W] bool: pixels whose centre lies inside a convex polygon of either orientation."""
+def fill_polygon(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
+    """[H, W] bool: pixels whose centre lies inside a convex polygon [M, 2] of either orientation, in pixels."""
     mask = np.zeros((height, width), dtype=bool)
     low = np.clip(np.floor(polygon.min(0)), 0, [width, height]).astype(int)
     high = np.clip(np.ceil(polygon.max(0)), 0, [width, height]).astype(int)
@@ -61,13 +53,9 @@ def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def guard_gaussians(
-    gaussians: Gaussians,
-    candidates: np.ndarray,  # [N] bool, the kept ones
-    polygon: np.ndarray,  # [M, 2]
-    camera: Camera,
-    scale: float,
+    gaussians: Gaussians, candidates: np.ndarray, polygon: np.ndarray, camera: Camera, scale: float
 ) -> np.ndarray:
-    """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
+    """[N] bool: candidates [N] with their centre in the guard band of a polygon [M, 2] (paper 3.2, steps 2 and 3)."""
     uv, _ = camera.project(gaussians.means.astype(np.float64))
     rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
     centre, (u, v) = polygon.mean(0), uv[rows].T

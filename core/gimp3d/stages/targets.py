@@ -30,23 +30,14 @@ EDGE = 3  # px that splats blur the edge of what stands before a void: else T is
 
 
 def all_needed(
-    before: Sequence[ViewBefore],
-    after: Sequence[ViewAfter],
-    centre: np.ndarray,  # [3] of the region
-    margin: int,  # px by which T grows
+    before: Sequence[ViewBefore], after: Sequence[ViewAfter], centre: np.ndarray, margin: int
 ) -> list[np.ndarray]:
-    """[H, W] bool each: the pixels to fill, judged by all views together."""
+    """[H, W] bool each: the pixels to fill, judged by all views; T grows by `margin` px; `centre` [3], the region's."""
     sight = Sight.make([(b.camera, b.depth, a.untrusted(b)) for b, a in zip(before, after)], centre)
     return parallel_map(lambda v: _needed(v[0].camera, v[1], sight, centre, margin), list(zip(before, after)))
 
 
-def _needed(
-    view: Camera,
-    after: ViewAfter,
-    sight: Sight,
-    centre: np.ndarray,
-    margin: int,
-) -> np.ndarray:
+def _needed(view: Camera, after: ViewAfter, sight: Sight, centre: np.ndarray, margin: int) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw.
 
     A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
@@ -83,12 +74,9 @@ def uncovered(gaussians: Gaussians, removed: np.ndarray, view: ViewBefore) -> np
     return view.polygon & (covered <= GUARD_FOOTPRINT)
 
 
-def in_front(
-    depth: np.ndarray,  # [H, W] z with the object
-    object_: np.ndarray,  # [H, W] bool
-    reach: int,  # px round the object's outline that are looked at
-) -> np.ndarray:
-    """[H, W] bool: surface at the object's outline behind whose continuation the object lies, and a pixel round it.
+def in_front(depth: np.ndarray, object_: np.ndarray, reach: int) -> np.ndarray:
+    """[H, W] bool: surface at the outline of the object (`object_` [H, W] bool, z with it in `depth` [H, W]) behind
+    whose continuation the object lies, and a pixel round it. `reach` px round the outline are looked at.
 
     The continuation is a plane in disparity, level where the surface falls off on its other side. The floor before the
     object's foot rises to it and is not in front, however flat the view; a thin rod is, close as it may stand.
@@ -105,13 +93,10 @@ def in_front(
     return dilated(front & ~object_, 1)
 
 
-def continues_outside(
-    depth: np.ndarray,  # [H, W] z without the object, 0 = nothing
-    alpha: np.ndarray,  # [H, W]
-    touched: np.ndarray,  # [H, W] bool, by the object
-    distance: float,  # of the object, beyond which steps are of disparity, as for Sight
-) -> np.ndarray:
-    """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
+def continues_outside(depth: np.ndarray, alpha: np.ndarray, touched: np.ndarray, distance: float) -> np.ndarray:
+    """[H, W] bool: surfaces (z without the object, 0 = nothing, in `depth` [H, W]), and the void of scans without a
+    background, that go on beyond what the object `touched` [H, W] bool. Beyond the object's `distance` steps are of
+    disparity, as for Sight.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
     by other views past the table's edge, but it is not what was behind the object.
@@ -133,13 +118,10 @@ def continues_outside(
     return there & (outside >= LEAST_OUTSIDE)[surface]
 
 
-def _tidy(
-    target: np.ndarray,  # [H, W] bool
-    certain: np.ndarray,  # [H, W] bool, where thin parts are no noise
-    allowed: np.ndarray,  # [H, W] bool, what the object touched
-    margin: int,
-) -> np.ndarray:
-    """Close pinholes, drop thin parts that are not certain, and grow by a margin within what the object touched."""
+def _tidy(target: np.ndarray, certain: np.ndarray, allowed: np.ndarray, margin: int) -> np.ndarray:
+    """Close a target's pinholes, drop thin parts that are not `certain`, and grow by a margin within what the object
+    touched (`allowed`); all [H, W] bool.
+    """
     solid = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     grown = dilated(solid, margin)

@@ -75,10 +75,7 @@ class ViewRefinement:
 def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: Call) -> ViewRefinement:
     """Ask about one view after the other.
 
-    Raises
-    ------
-    BadInput
-        If the painter fails at the first view; later failures only refuse their view.
+    Raises BadInput if the painter fails at the first view; later failures only refuse their view.
     """
     asked = [view for view in views if int(_mask(view).sum()) >= LEAST]
     done: list[RefinedView] = []
@@ -121,12 +118,10 @@ def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> Refi
     )
 
 
-def side_by_side(
-    reference: np.ndarray,  # [h', w', 3] uint8
-    view: np.ndarray,  # [h, w, 3] uint8
-    mask: np.ndarray,  # [h, w] bool
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """The reference left, as high as the view right; the mask, empty on the left; the column where right begins."""
+def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """The reference [h', w', 3] uint8 left, as high as the view [h, w, 3] uint8 right; the mask [h, w] bool, empty on
+    the left; the column where right begins.
+    """
     factor = min(1.0, LONGEST / max(mask.shape))
     height, width = (max(1, round(factor * side)) for side in mask.shape)
     beside = max(1, min(LONGEST, round(reference.shape[1] * height / reference.shape[0])))

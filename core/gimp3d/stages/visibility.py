@@ -28,12 +28,10 @@ class Sight:
     limits: np.ndarray  # float32, z of the first surface of every pixel; HIDDEN where there is none
 
     @classmethod
-    def make(
-        cls,
-        views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, untrusted pixels)
-        centre: np.ndarray,  # [3] of the object, scene coordinates
-    ) -> Sight:
-        """From depth maps [H, W], 0 = nothing, and masks [H, W] bool of the object and of what else hides the scene."""
+    def make(cls, views: Sequence[tuple[Camera, np.ndarray, np.ndarray]], centre: np.ndarray) -> Sight:
+        """From views' depth maps with the object [H, W], 0 = nothing, and masks [H, W] bool of the object and of what
+        else hides the scene; `centre` [3] is the object's, in scene coordinates.
+        """
         order = [views[k] for k in _spread_order(len(views))]
         away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
         packed = [np.append(pack_camera(c), far) for (c, _, _), far in zip(order, away)]
@@ -41,14 +39,11 @@ class Sight:
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
 
-    def of(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-        tolerance: float,  # relative z, up to the centre's distance; beyond it, of disparity times that distance
-    ) -> np.ndarray:
-        """[N] uint8: SHOWN if the point is the first surface of some view, which is not hidden there; SEEN_PAST if it
-        is not, and some view sees a surface behind it; BURIED if it lies behind surfaces in most views, so that it is
-        on none; else HIDES: the object alone hides it.
+    def of(self, points: np.ndarray, tolerance: float) -> np.ndarray:
+        """[N] uint8 of points [N, 3] in scene coordinates: SHOWN if the point is the first surface of some view, which
+        is not hidden there; SEEN_PAST if it is not, and some view sees a surface behind it; BURIED if it lies behind
+        surfaces in most views, so that it is on none; else HIDES: the object alone hides it. The tolerance is of z
+        (relative) up to the centre's distance, beyond it of disparity times that distance.
 
         What is far away moves little between views, so depths there are little certain, and need not be: a sky's splats
         lie anywhere. A difference of disparity shifts pixels by the same amount at every distance.

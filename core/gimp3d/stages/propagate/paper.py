@@ -92,14 +92,11 @@ def lent_colours(mapped: Mapped, views: Sequence[Loader], settings: PropagateSet
 
 
 def sampled(
-    mapped: Mapped,
-    view: ViewToPaint,
-    lent: Sequence[Lent],
-    warp: Warp,
-    rules: np.ndarray,  # [h, w] uint8, REFERENCE where the warp reaches the hole
-    retarget: int,  # px
+    mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], warp: Warp, rules: np.ndarray, retarget: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole."""
+    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole. `rules` [h, w] uint8 come in as
+    REFERENCE where the warp reaches the hole; `retarget` is in px.
+    """
     sources = mapped.shown_in(picture_of(view), retarget)
     reached = rules == Rule.REFERENCE
     found = np.append(sources.rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
@@ -141,13 +138,11 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
 
 
 def blend_rim(
-    base: np.ndarray,  # [H, W, 3] uint8, the view round the hole
-    raw: np.ndarray,  # [H, W, 3] float32, the fill
-    painted: np.ndarray,  # [H, W] bool, where the fill is
-    no_photo: np.ndarray,  # [H, W] bool, what bounds no fill: the rest of the hole, renderings of the emptied scene
-    depth: np.ndarray,  # [H, W] z of the new scene
+    base: np.ndarray, raw: np.ndarray, painted: np.ndarray, no_photo: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """The paper's blend: gradients of the fill, its rim as in the view, [H, W, 3] uint8.
+    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32, its rim as in the view `base`
+    [H, W, 3] uint8. `painted` [H, W] bool is where the fill is, `no_photo` [H, W] bool what bounds none: the rest of
+    the hole, renderings of the emptied scene; `depth` [H, W] is z of the new scene.
 
     The rim counts only where no depth seam parts it from the fill. Parts without a rim keep their own colours.
     """

@@ -14,13 +14,11 @@ SMOOTHING = 1 / 20  # of the reach: half the side of the square that pairs are m
 
 
 def learned_change(
-    warped: np.ndarray,  # [h, w, 3] float32, the reference's colours in the view
-    difference: np.ndarray,  # [h, w, 3], the view less those
-    alike: np.ndarray,  # [h, w] bool, pixels round the hole that both show
-    hole: np.ndarray,  # [h, w] bool
-    reach: int,  # px, how far the surroundings go
+    warped: np.ndarray, difference: np.ndarray, alike: np.ndarray, hole: np.ndarray, reach: int
 ) -> ColourChange:
-    """How colours change from the reference to this view, by what both show round the hole.
+    """How colours change from the reference to this view, by what both show up to `reach` px round the `hole` [h, w]
+    bool: `warped` [h, w, 3] float32 are the reference's colours in the view, `difference` [h, w, 3] the view less
+    those, `alike` [h, w] bool the pixels that both show.
 
     What depends on the place (a highlight) comes into the hole from its rim, by the blend; what depends on the colour,
     hence on the material and on the exposure, is learned.
