@@ -10,7 +10,8 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..geometry import Window, window_round
 
-EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
+# A box's 12 edges, from and to which of Box.corners.
+EDGES = np.array([(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]).T
 
 
 def box_polygon(box: Box, camera: Camera, near: float) -> np.ndarray | None:
@@ -20,12 +21,9 @@ def box_polygon(box: Box, camera: Camera, near: float) -> np.ndarray | None:
     """
     points = camera.to_camera(box.corners())
     in_front = points[:, 2] >= near
-    visible = [points[in_front]]
-    for a, b in EDGES:
-        if in_front[a] != in_front[b]:
-            s = (near - points[a, 2]) / (points[b, 2] - points[a, 2])
-            visible.append((points[a] + s * (points[b] - points[a]))[None])
-    cut = np.concatenate(visible)
+    a, b = points[EDGES[:, in_front[EDGES[0]] != in_front[EDGES[1]]]]
+    s = (near - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
+    cut = np.concatenate([points[in_front], a + s * (b - a)])
     if len(cut) < 3:
         return None
     uv = cut[:, :2] / cut[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]

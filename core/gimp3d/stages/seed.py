@@ -14,7 +14,7 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
-from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals, window_mask
+from ..geometry import SAME_DEPTH, bounds, cropped, directions, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
 from ..sh import sh_basis
@@ -102,10 +102,9 @@ def seed_gaussians(
 
 def _grid_round(target: np.ndarray, size: int) -> tuple[slice, slice]:
     """Rows and columns of the squares of a grid that hold the target [H, W] bool, and of one more all round."""
-    ends = ((np.flatnonzero(target.any(1 - axis)), side) for axis, side in enumerate(target.shape))
     rows, cols = (
-        slice(max(0, x[0] // size - 1) * size, min(side, (x[-1] // size + 2) * size)) if len(x) else slice(0, size)
-        for x, side in ends
+        slice(max(0, s.start // size - 1) * size, min(side, ((s.stop - 1) // size + 2) * size))
+        for s, side in zip(bounds(target), target.shape)
     )
     return rows, cols
 

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SAME_DEPTH, SOLID, cropped, dilated, surface_points, window_round
 from ..raster import render
+from .growth import components
 from .look import AROUND, MOSTLY_OBJECT, ViewAfter, ViewBefore
 from .outline import guard_gaussians
 from .visibility import HIDES, SHOWN, Sight
@@ -109,12 +108,9 @@ def continues_outside(depth: np.ndarray, alpha: np.ndarray, touched: np.ndarray,
         low, high = np.minimum(z[near], z[far]), np.maximum(z[near], z[far])
         close = high - low < LAYER_STEP * low * np.maximum(1, high / distance)
         same = there[near] & there[far] & np.where(void[near], void[far], close & ~void[far])
-        pairs.append(np.stack([index[near][same], index[far][same]]))
-    a, b = np.concatenate(pairs, axis=1)
-    graph = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (z.size, z.size))
-    count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    surface = surface.reshape(z.shape)
-    outside = np.bincount(surface[there & ~touched], minlength=count)
+        pairs.append(np.stack([index[near][same], index[far][same]], axis=1))
+    surface = components(np.concatenate(pairs), z.size).reshape(z.shape)
+    outside = np.bincount(surface[there & ~touched], minlength=z.size)
     return there & (outside >= LEAST_OUTSIDE)[surface]
 
 

@@ -32,7 +32,8 @@ class Sight:
         """From views' depth maps with the object [H, W], 0 = nothing, and masks [H, W] bool of the object and of what
         else hides the scene; `centre` [3] is the object's, in scene coordinates.
         """
-        order = [views[k] for k in _spread_order(len(views))]
+        # Neighbouring views see the same: any first few of the order are spread evenly.
+        order = [views[k] for k in sorted(range(len(views)), key=lambda k: (k * 0.6180339887498949) % 1.0)]
         away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
         packed = [np.append(pack_camera(c), far) for (c, _, _), far in zip(order, away)]
         limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
@@ -84,11 +85,6 @@ def depth_agreement(
         return 1.0
     same, through = np.sum(parallel_map(compared, range(len(cameras))), axis=0)
     return float(same / (same + through)) if same + through else 1.0
-
-
-def _spread_order(count: int) -> list[int]:
-    """0 … count−1 so that any first few are spread evenly: neighbouring views see the same."""
-    return sorted(range(count), key=lambda k: (k * 0.6180339887498949) % 1.0)
 
 
 @exact_kernel
