@@ -10,6 +10,7 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..geometry import Window, window_round
 
+GUARD_SCALE = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
 # A box's 12 edges, from and to which of Box.corners.
 EDGES = np.array([(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]).T
 
@@ -50,15 +51,13 @@ def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
 
 
-def guard_gaussians(
-    gaussians: Gaussians, candidates: np.ndarray, polygon: np.ndarray, camera: Camera, scale: float
-) -> np.ndarray:
+def guard_gaussians(gaussians: Gaussians, candidates: np.ndarray, polygon: np.ndarray, camera: Camera) -> np.ndarray:
     """[N] bool: candidates [N] with their centre in the guard band of a polygon [M, 2] (paper 3.2, steps 2 and 3)."""
     uv, _ = camera.project(gaussians.means.astype(np.float64))
     rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
     centre, (u, v) = polygon.mean(0), uv[rows].T
     found = np.zeros(len(uv), bool)
-    found[rows] = _inside(centre + scale * (polygon - centre), u, v) & ~_inside(polygon, u, v)
+    found[rows] = _inside(centre + GUARD_SCALE * (polygon - centre), u, v) & ~_inside(polygon, u, v)
     return found
 
 

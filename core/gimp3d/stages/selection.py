@@ -214,9 +214,9 @@ def boxes_of(camera: Camera, depth: np.ndarray, region: Region, surroundings: Se
     return np.stack([replace(b, size=b.size + slack).contains(points) for b in region], axis=1)
 
 
-def standing(members: Sequence[np.ndarray], outlines: Sequence[int], least: float = LEAST_OBJECT) -> list[bool]:
+def standing(members: Sequence[np.ndarray], outlines: Sequence[int]) -> list[bool]:
     """Which boxes something stands in: greedily those that hold most of it (`members` [M, B] bool of each view,
-    `boxes_of`), as long as they add enough in some view: `least` of the `outlines`, the region's pixels in each.
+    `boxes_of`), as long as they add enough in some view to the `outlines`, the region's pixels in each.
 
     A box round a shadow also holds the object's foot; that is the object's box's already.
     """
@@ -224,7 +224,7 @@ def standing(members: Sequence[np.ndarray], outlines: Sequence[int], least: floa
     left = list(members)
     while True:
         counts = np.array([m.sum(0) for m in left])
-        enough = (counts > least * np.array(outlines)[:, None]).any(0)
+        enough = (counts > LEAST_OBJECT * np.array(outlines)[:, None]).any(0)
         if not enough.any():
             return found
         best = int(np.argmax(np.where(enough, counts.sum(0), -1)))

@@ -17,7 +17,6 @@ from .look import AROUND, MOSTLY_OBJECT, ViewAfter, ViewBefore
 from .outline import guard_gaussians
 from .visibility import HIDES, SHOWN, Sight
 
-GUARD_SCALE = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
 GUARD_FOOTPRINT = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill (paper 3.2)
 CHANGED = 0.02  # blend weight of removed Gaussians above which the object touched a pixel: five grey levels of 255
 VOID = 0.1  # alpha after removal below which there is nothing
@@ -68,7 +67,7 @@ def _needed(view: Camera, after: ViewAfter, sight: Sight, centre: np.ndarray, ma
 def uncovered(gaussians: Gaussians, removed: np.ndarray, view: ViewBefore) -> np.ndarray:
     """[H, W] bool: T as the paper defines it (3.2), the polygon less the guard Gaussians' footprints."""
     usable = ~removed & gaussians.usable
-    guards = [guard_gaussians(gaussians, usable, p, view.camera, GUARD_SCALE) for p in view.polygons]
+    guards = [guard_gaussians(gaussians, usable, p, view.camera) for p in view.polygons]
     covered = render(gaussians.take(np.any(guards, axis=0)), view.camera, passes=frozenset({"alpha"})).alpha
     return view.polygon & (covered <= GUARD_FOOTPRINT)
 

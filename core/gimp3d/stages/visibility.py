@@ -15,6 +15,7 @@ from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import SAME_DEPTH, Window, framed, pack_camera, project, surface_points
 
+SAMPLES = 1000  # of each view's surface that are compared with another's, about
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
 HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
 
@@ -34,8 +35,7 @@ class Sight:
         """
         # Neighbouring views see the same: any first few of the order are spread evenly.
         order = [views[k] for k in sorted(range(len(views)), key=lambda k: (k * 0.6180339887498949) % 1.0)]
-        away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
-        packed = [np.append(pack_camera(c), far) for (c, _, _), far in zip(order, away)]
+        packed = [np.append(pack_camera(c), np.linalg.norm(c.centre - centre)) for c, _, _ in order]
         limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
@@ -55,16 +55,9 @@ class Sight:
         return found
 
 
-def depth_agreement(
-    cameras: Sequence[Camera],
-    depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
-    windows: Sequence[Window],  # the parts to look at
-    tolerance: float = SAME_DEPTH,  # relative z
-    samples: int = 1000,  # per view
-) -> float:
-    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.
-
-    1 where nothing can be compared.
+def depth_agreement(cameras: Sequence[Camera], depths: Sequence[np.ndarray], windows: Sequence[Window]) -> float:
+    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too; 1
+    where nothing can be compared. Looked at are the windows of the depth maps [H, W], 0 = nothing.
     """
     centres = np.array([c.centre for c in cameras])
     forwards = np.array([c.forward for c in cameras])
@@ -75,9 +68,9 @@ def depth_agreement(
         apart[k] = np.inf
         other = int(apart.argmin())
         _, _, points = surface_points(cameras[k], depths[k], windows[k])
-        _, rows, cols, z = framed(cameras[other], points[:: max(1, len(points) // samples)])
+        _, rows, cols, z = framed(cameras[other], points[:: max(1, len(points) // SAMPLES)])
         there = depths[other][rows, cols]
-        coarse = max(tolerance, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
+        coarse = max(SAME_DEPTH, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
         through = (there > z * (1 + coarse)) | (there == 0)
         return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
 
