@@ -32,13 +32,8 @@ class Exposure:
         """A photo [H, W, 3] uint8 at the splats' exposure; the photo itself if its gain is 1."""
         return photo if (self.gain == 1).all() else _times(photo, 1 / self.gain)
 
-    def back(
-        self,
-        picture: np.ndarray,  # [H, W, 3] uint8 at the splats' exposure
-        photo: np.ndarray,  # [H, W, 3] uint8
-        changed: np.ndarray,  # [H, W] bool
-    ) -> np.ndarray:
-        """The photo with the picture, at the photo's exposure, where it was changed."""
+    def back(self, picture: np.ndarray, photo: np.ndarray, changed: np.ndarray) -> np.ndarray:
+        """The photo with the picture at its exposure, both [H, W, 3] uint8, where that was changed [H, W] bool."""
         return np.where(changed[..., None], _times(picture, self.gain), photo)
 
 
@@ -51,12 +46,8 @@ class Exposures:
     reason: str
 
 
-def exposures_of(
-    kept: Gaussians,  # the scene without the object
-    views: Sequence[ViewMasks],
-    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8
-) -> Exposures:
-    """Compare photos with the splats round the object."""
+def exposures_of(kept: Gaussians, views: Sequence[ViewMasks], photos: Mapping[str, np.ndarray]) -> Exposures:
+    """Compare photos (by ID, [H, W, 3] uint8) with the splats round the object; `kept` is the scene without it."""
 
     def compare(view: ViewMasks) -> Exposure:
         ring = exposure_ring(view)
@@ -77,12 +68,10 @@ def exposure_ring(view: ViewMasks) -> np.ndarray:
     return (distance > 0) & (distance <= reach) & (view.alpha_after > SOLID) & ~view.target
 
 
-def level_exposure(
-    ring: np.ndarray,  # [H, W] bool, see exposure_ring
-    photo: np.ndarray,  # [H, W, 3] uint8
-    drawn: np.ndarray,  # [H, W, 3] uint8, the splats without the object; only the ring is looked at
-) -> Exposure:
-    """A photo's gain over the splats, measured round the object, if dividing by it clearly fits better."""
+def level_exposure(ring: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> Exposure:
+    """A photo's [H, W, 3] gain over the splats, as `drawn` without the object, in the ring round that
+    (`exposure_ring`), if dividing by it clearly fits better.
+    """
     unchanged = Exposure(np.ones(3))
     gain = exposure_gain(drawn[ring], photo[ring])
     if (gain > MAX_GAIN).any() or (gain < 1 / MAX_GAIN).any():

@@ -99,7 +99,7 @@ def find_growth(
     radius = TOUCH * spacing
     pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
     pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < COLOUR).all(1)]
-    parts = _components(pairs, len(rows))
+    parts = components(pairs, len(rows))
     held, cut = np.bincount(parts[object_], minlength=len(rows)), np.bincount(parts[~object_], minlength=len(rows))
     known = in_region([_enlarged(box, -spacing) for box in outer], points)
     endless = np.bincount(parts[~object_ & ~known], minlength=len(rows)) > 0
@@ -108,7 +108,7 @@ def find_growth(
     renumbered = np.full(len(rows), -1)
     renumbered[grown] = np.arange(len(grown))
     within = renumbered[pairs]
-    pieces = _components(within[(within >= 0).all(1)], len(grown))
+    pieces = components(within[(within >= 0).all(1)], len(grown))
     sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
     grown = grown[((sizes >= LEAST) & (likes > sizes / 2))[pieces]]
     outside = int((~in_region(region, points[grown])).sum())
@@ -122,13 +122,10 @@ def find_growth(
     return Growth(found, (*region[:least], holding[least], *region[least + 1 :]), holding[least])
 
 
-def _likelihood(
-    colours: np.ndarray,  # [M, 3] in [0, 1]
-    weights: np.ndarray,  # [M]
-    object_: np.ndarray,  # [M] bool, what is the object's for sure
-    surface: np.ndarray,  # [M] bool, what is mostly surface
-) -> np.ndarray:
-    """[M]: the probability by colour that a Gaussian is the object's, from smoothed histograms of both."""
+def _likelihood(colours: np.ndarray, weights: np.ndarray, object_: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """[M]: the probability by colour [M, 3] in [0, 1] that a Gaussian is the object's, from smoothed histograms,
+    weighted [M], of what is the object's for sure and what is mostly surface, [M] bool each.
+    """
     index = np.minimum(colours * BINS, BINS - 1).astype(int) @ np.array([BINS * BINS, BINS, 1])
 
     def density(rows: np.ndarray) -> np.ndarray:
@@ -139,7 +136,7 @@ def _likelihood(
     return of_object / np.maximum(of_object + of_surface, 1e-12)
 
 
-def _components(pairs: np.ndarray, count: int) -> np.ndarray:
+def components(pairs: np.ndarray, count: int) -> np.ndarray:
     """[count]: the number of each node's connected component, of the graph with edges [E, 2]."""
     graph = scipy.sparse.coo_matrix((np.ones(len(pairs), bool), pairs.T), (count, count))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

@@ -81,10 +81,7 @@ def look(
 ) -> ViewBefore:
     """A view with the object.
 
-    Raises
-    ------
-    BadInput
-        If the photo or the extra mask has not the view's size.
+    Raises BadInput if the photo or the extra mask has not the view's size.
     """
     for kind, picture in (("photo", photo), ("extra mask", extra)):
         if picture is not None and picture.shape[:2] != (camera.height, camera.width):
@@ -110,13 +107,8 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).sum()) / spread if spread > 1e-6 * a.size else np.nan
 
 
-def look_without(
-    gaussians: Gaussians,
-    gone: Gaussians,  # the removed ones
-    removed: np.ndarray,  # [N] bool
-    view: ViewBefore,
-) -> ViewAfter:
-    """A view without the object; only the part that the object touched is drawn anew."""
+def look_without(gaussians: Gaussians, gone: Gaussians, removed: np.ndarray, view: ViewBefore) -> ViewAfter:
+    """A view without the object, `gone`, the rows `removed` [N] bool; only the part that it touched is drawn anew."""
     window = touched_window(gone, view.camera, AROUND)
     scene = drawing(gaussians, view.camera, with_colour=False, pixels=window_mask(window, view.camera))
     depth, alpha = scene.surface_depth(gone=removed)

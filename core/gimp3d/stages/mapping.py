@@ -33,7 +33,6 @@ class MappingField:
     rows: np.ndarray  # [H, W] int32, -1 where there is none
     cols: np.ndarray  # [H, W] int32
     cost: np.ndarray  # [H, W] float32, (1 − λ_s)·appearance + λ_v (1 − v)
-    visibility: np.ndarray  # [H, W] float32, v(q)
     confidence: float
     reason: str
 
@@ -86,7 +85,7 @@ def mapping_field(
         confidence = float(np.exp(-misfit / MISFIT))
         reason = f"fill explained to {misfit:.1f} grey levels; "
         reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
-    return MappingField(nearest.rows, nearest.cols, nearest.cost, visibility, confidence, reason)
+    return MappingField(nearest.rows, nearest.cols, nearest.cost, confidence, reason)
 
 
 def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:

@@ -10,26 +10,21 @@ from ..camera import Camera
 from ..gaussians import Gaussians
 from ..geometry import Window, window_round
 
-EDGES = [(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]  # a box's 12 edges, see Box.corners
+GUARD_SCALE = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
+# A box's 12 edges, from and to which of Box.corners.
+EDGES = np.array([(a, a | 1 << b) for a in range(8) for b in range(3) if not a >> b & 1]).T
 
 
-def box_polygon(
-    box: Box,
-    camera: Camera,
-    near: float,  # z below which the box is cut away, scene units
-) -> np.ndarray | None:
-    """The convex outline of a box in a view, [M, 2] pixels, clipped against the near plane before projecting.
+def box_polygon(box: Box, camera: Camera, near: float) -> np.ndarray | None:
+    """The convex outline of a box in a view, [M, 2] pixels, cut away at z below `near` (scene units) before projecting.
 
     None if nothing of the box lies in front of the camera.
     """
     points = camera.to_camera(box.corners())
     in_front = points[:, 2] >= near
-    visible = [points[in_front]]
-    for a, b in EDGES:
-        if in_front[a] != in_front[b]:
-            s = (near - points[a, 2]) / (points[b, 2] - points[a, 2])
-            visible.append((points[a] + s * (points[b] - points[a]))[None])
-    cut = np.concatenate(visible)
+    a, b = points[EDGES[:, in_front[EDGES[0]] != in_front[EDGES[1]]]]
+    s = (near - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
+    cut = np.concatenate([points[in_front], a + s * (b - a)])
     if len(cut) < 3:
         return None
     uv = cut[:, :2] / cut[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
@@ -37,12 +32,8 @@ def box_polygon(
     return hull if len(hull) >= 3 else None
 
 
-def fill_polygon(
-    polygon: np.ndarray,  # [M, 2] convex, pixels
-    width: int,
-    height: int,
-) -> np.ndarray:
-    """[H, W] bool: pixels whose centre lies inside a convex polygon of either orientation."""
+def fill_polygon(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
+    """[H, W] bool: pixels whose centre lies inside a convex polygon [M, 2] of either orientation, in pixels."""
     mask = np.zeros((height, width), dtype=bool)
     low = np.clip(np.floor(polygon.min(0)), 0, [width, height]).astype(int)
     high = np.clip(np.ceil(polygon.max(0)), 0, [width, height]).astype(int)
@@ -60,19 +51,13 @@ def _inside(polygon: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
 
 
-def guard_gaussians(
-    gaussians: Gaussians,
-    candidates: np.ndarray,  # [N] bool, the kept ones
-    polygon: np.ndarray,  # [M, 2]
-    camera: Camera,
-    scale: float,
-) -> np.ndarray:
-    """[N] bool: candidates whose centre projects into the guard band (paper 3.2, steps 2 and 3)."""
+def guard_gaussians(gaussians: Gaussians, candidates: np.ndarray, polygon: np.ndarray, camera: Camera) -> np.ndarray:
+    """[N] bool: candidates [N] with their centre in the guard band of a polygon [M, 2] (paper 3.2, steps 2 and 3)."""
     uv, _ = camera.project(gaussians.means.astype(np.float64))
     rows = np.flatnonzero(candidates & np.isfinite(uv).all(1))
     centre, (u, v) = polygon.mean(0), uv[rows].T
     found = np.zeros(len(uv), bool)
-    found[rows] = _inside(centre + scale * (polygon - centre), u, v) & ~_inside(polygon, u, v)
+    found[rows] = _inside(centre + GUARD_SCALE * (polygon - centre), u, v) & ~_inside(polygon, u, v)
     return found
 
 

@@ -48,29 +48,22 @@ def rim(view: ViewMasks) -> np.ndarray:
     return ~view.target & (view.alpha_after > SOLID) & (view.depth_after > 0)
 
 
-@dataclass(frozen=True)
-class NeededSurface:
-    """Samples of the surface that has to be made up, one per patch of equal area."""
+def needed_surface(views: Sequence[ViewMasks], samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+    """Where the hidden surface probably is: the holes of some views, provisionally completed and put together.
 
-    points: np.ndarray  # [S, 3] float64, world
-    normals: np.ndarray  # [S, 3] unit, world, facing the view they come from
-
-
-def needed_surface(
-    views: Sequence[ViewMasks],
-    samples: int = SAMPLES,  # from each view
-) -> NeededSurface:
-    """Where the hidden surface probably is: the holes of some views, provisionally completed and put together."""
+    Points [S, 3] float64 in the world, one per patch of equal area, of as many `samples` from each view, and unit
+    normals [S, 3] facing the view they come from.
+    """
     seeing = [v for v in views if v.target.any()]
     step = max(1, -(-len(seeing) // SURFACE_VIEWS))
     parts = parallel_map(lambda v: _surface_in(v, samples), seeing[::step], most=2)  # mostly Python's work
     points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
     if not len(points):
-        return NeededSurface(points, normals)
+        return points, normals
     cell = float(np.median(sizes))
     # The first sample in each cell stands for it, so that views do not count by the number of their pixels.
     _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
-    return NeededSurface(points[np.sort(first)], normals[np.sort(first)])
+    return points[np.sort(first)], normals[np.sort(first)]
 
 
 def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
@@ -114,17 +107,10 @@ def choose_reference(
     Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
     the best view of it: 1 is a view that shows everything as well as any does.
 
-    Raises
-    ------
-    IllPosed
-        If the wanted view does not see the hole, or no view does.
+    Raises IllPosed if the wanted view does not see the hole, or no view does.
     """
     surface = needed_surface(views)
-
-    def shown_in(view: ViewMasks) -> tuple[np.ndarray, np.ndarray] | None:
-        return _seen(view, surface) if view.target.any() else None
-
-    seen = parallel_map(shown_in, views, most=2)
+    seen = parallel_map(lambda v: _seen(v, *surface) if v.target.any() else None, views, most=2)
     untried = ((v, s) for v, s in zip(views, seen) if v.camera.id not in tried)
     candidates = [(v, *s) for v, s in untried if s is not None and s[0].any() and (dilated(v.target, 1) & rim(v)).any()]
     if not candidates:
@@ -150,11 +136,11 @@ def choose_reference(
     return ReferenceChoice(chosen.camera_id, tuple(scores), chosen.score / scores[0].score, reason)
 
 
-def _seen(view: ViewMasks, surface: NeededSurface) -> tuple[np.ndarray, np.ndarray]:
+def _seen(view: ViewMasks, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """cos θ and pixels per area [S] of each sample in a view's hole; both 0 where it does not show it."""
     camera = view.camera
-    index, rows, cols, z = framed(camera, surface.points)
-    cosine = -(surface.normals * directions(surface.points, camera)).sum(-1)
+    index, rows, cols, z = framed(camera, points)
+    cosine = -(normals * directions(points, camera)).sum(-1)
     shown = view.target[rows, cols] & (cosine[index] > 0)
     index, z = index[shown], z[shown]
     found = np.zeros((2, len(cosine)))

@@ -52,12 +52,8 @@ class Observation:
     weight: np.ndarray  # [H, W] float32 ≥ 0, how far each pixel is trusted
 
 
-def observed(
-    camera: Camera,
-    image: np.ndarray,  # [H, W, 3] uint8, the painted view
-    rules: np.ndarray,  # [H, W] uint8, see Rule
-) -> Observation:
-    """What a painted view tells of its hole."""
+def observed(camera: Camera, image: np.ndarray, rules: np.ndarray) -> Observation:
+    """What a painted view, `image` [H, W, 3] uint8 by its `rules` [H, W] uint8, tells of its hole."""
     weight = np.where(rules == Rule.EVIDENCE, 1.0, PAINTED) * ~np.isin(rules, (Rule.UNTOUCHED, Rule.UNREACHED))
     return Observation(camera, image, rules != Rule.UNTOUCHED, weight.astype(np.float32))
 

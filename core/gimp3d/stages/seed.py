@@ -14,7 +14,7 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
-from ..geometry import SAME_DEPTH, cropped, directions, sees, surface_normals, window_mask
+from ..geometry import SAME_DEPTH, bounds, cropped, directions, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
 from ..sh import sh_basis
@@ -61,10 +61,7 @@ def seed_gaussians(
     The target is cut into rectangles (see `_patches`). Each becomes one Gaussian in the surface's tangent plane whose
     picture in the reference has the rectangle's shape, so that neighbours meet without cracks at any slant.
 
-    Raises
-    ------
-    BadInput
-        If `settings.largest` is no power of two.
+    Raises BadInput if `settings.largest` is no power of two.
     """
     if settings.largest < 1 or settings.largest & (settings.largest - 1):
         raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")
@@ -105,22 +102,18 @@ def seed_gaussians(
 
 def _grid_round(target: np.ndarray, size: int) -> tuple[slice, slice]:
     """Rows and columns of the squares of a grid that hold the target [H, W] bool, and of one more all round."""
-    ends = ((np.flatnonzero(target.any(1 - axis)), side) for axis, side in enumerate(target.shape))
     rows, cols = (
-        slice(max(0, x[0] // size - 1) * size, min(side, (x[-1] // size + 2) * size)) if len(x) else slice(0, size)
-        for x, side in ends
+        slice(max(0, s.start // size - 1) * size, min(side, ((s.stop - 1) // size + 2) * size))
+        for s, side in zip(bounds(target), target.shape)
     )
     return rows, cols
 
 
 def _patches(
-    image: np.ndarray,  # [H, W, 3] uint8
-    disparity: np.ndarray,  # [H, W]
-    target: np.ndarray,  # [H, W] bool, to be covered
-    normals: np.ndarray,  # [H, W, 3]
-    settings: SeedSettings,
+    image: np.ndarray, disparity: np.ndarray, target: np.ndarray, normals: np.ndarray, settings: SeedSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rectangles (top, left, height, width) [N, 4] that tile the target; sums of colour, disparity, normal [N, 7].
+    """Rectangles (top, left, height, width) [N, 4] that tile the target [H, W] bool; sums [N, 7] of their colours
+    `image` [H, W, 3] uint8, disparities [H, W] and normals [H, W, 3].
 
     From squares of a grid, every rectangle is halved, across the side where that saves more, until its colours are one
     and its surface is plane, nearly. Colours that change evenly would be blended well by few large splats, too, but
@@ -147,11 +140,8 @@ def _patches(
     return found, tables.sums(found)
 
 
-def _halved(
-    rectangles: np.ndarray,  # [N, 4]
-    tables: _SumTables,
-) -> np.ndarray:
-    """Both halves of each, cut so that colours are fitted best and no side is longer than four times the other."""
+def _halved(rectangles: np.ndarray, tables: _SumTables) -> np.ndarray:
+    """Both halves of each [N, 4], cut so that colours are fitted best and no side exceeds four times the other."""
     halves, misfits = [], []
     for axis in (0, 1):
         first = rectangles.copy()
@@ -287,12 +277,10 @@ def settle_gaussians(
 
 
 def _colour_change(
-    steps: Sequence[tuple[np.ndarray, np.ndarray]],  # per view: weights and what is missing, [N, 3] each
-    towards: Sequence[np.ndarray],  # per view: unit directions to the Gaussians, [N, 3]
-    degree: int,
-    hold: float,  # weight by which each coefficient is held
+    steps: Sequence[tuple[np.ndarray, np.ndarray]], towards: Sequence[np.ndarray], degree: int, hold: float
 ) -> np.ndarray:
-    """What must be added to the coefficients, [N, K, 3]: robust least squares with a ridge, over the views' directions.
+    """What must be added to the coefficients, [N, K, 3]: robust least squares with a ridge, over the views' unit
+    directions `towards` the Gaussians [N, 3]. `steps` are each view's weights and what is missing there, [N, 3] each.
 
     The basis is taken less its mean over the views, so that what all of them miss is no view dependence, and few
     directions, or near ones, tell c_0 alone. What a view misses by far more than is usual counts little (Geman and

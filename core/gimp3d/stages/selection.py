@@ -81,10 +81,7 @@ class Selection:
             f"{self.count(Fate.REMOVED_MASKED)} under extra masks",
             f"{self.count(Fate.REMOVED_GROWN)} that the box cut off",
         ]
-        stay = [
-            f"{self.count(Fate.KEPT_SURFACE)} of floor or wall",
-            f"{self.count(Fate.KEPT_STRADDLING)} straddlers",
-        ]
+        stay = [f"{self.count(Fate.KEPT_SURFACE)} of floor or wall", f"{self.count(Fate.KEPT_STRADDLING)} straddlers"]
         parts = [", ".join(p for p in part if not p.startswith("0 ")) or "none" for part in (gone, stay)]
         return f"{int(self.removed.sum())} Gaussians go ({parts[0]}), in the region stay {parts[1]}"
 
@@ -127,10 +124,8 @@ def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
     return inside
 
 
-def by_centre(
-    inside: np.ndarray,  # [N] bool, see select_removed
-) -> Selection:
-    """The paper's rule."""
+def by_centre(inside: np.ndarray) -> Selection:
+    """The paper's rule, of rows `inside` [N] bool (`select_removed`)."""
     return Selection(np.where(inside, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
 
 
@@ -189,12 +184,10 @@ def _sighting(view: ViewBefore, object_: np.ndarray, ring: np.ndarray) -> Sighti
 
 
 def object_and_rim(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z with the object, 0 = nothing
-    region: Region,
-    surroundings: Sequence[FollowedSurface],
+    camera: Camera, depth: np.ndarray, region: Region, surroundings: Sequence[FollowedSurface]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels whose first surface lies in the region and is not the surroundings', and the ring round them.
+    """Pixels of a depth map with the object [H, W], 0 = nothing, whose first surface lies in the region and is not the
+    surroundings', and the ring round them.
 
     Both [H, W] bool. In the ring the colours of splats that stand where the object meets the floor run together.
     """
@@ -214,24 +207,16 @@ def object_and_rim(
     return object_, dilated(object_, width) & ~object_
 
 
-def boxes_of(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z of the object alone
-    region: Region,
-    surroundings: Sequence[FollowedSurface],
-) -> np.ndarray:
-    """[M, B] bool: the boxes in which each of the object's pixels lies, or just outside."""
+def boxes_of(camera: Camera, depth: np.ndarray, region: Region, surroundings: Sequence[FollowedSurface]) -> np.ndarray:
+    """[M, B] bool: the boxes in which each pixel of the object's own depth map [H, W] lies, or just outside."""
     _, _, points = surface_points(camera, depth)
     slack = 2 * SLACK * max(part.cell for part in surroundings)
     return np.stack([replace(b, size=b.size + slack).contains(points) for b in region], axis=1)
 
 
-def standing(
-    members: Sequence[np.ndarray],  # [M, B] bool of each view, see boxes_of
-    outlines: Sequence[int],  # pixels of the region in each view
-    least: float = LEAST_OBJECT,  # share of them
-) -> list[bool]:
-    """Which boxes something stands in: greedily those that hold most of it, as long as they add enough in some view.
+def standing(members: Sequence[np.ndarray], outlines: Sequence[int]) -> list[bool]:
+    """Which boxes something stands in: greedily those that hold most of it (`members` [M, B] bool of each view,
+    `boxes_of`), as long as they add enough in some view to the `outlines`, the region's pixels in each.
 
     A box round a shadow also holds the object's foot; that is the object's box's already.
     """
@@ -239,7 +224,7 @@ def standing(
     left = list(members)
     while True:
         counts = np.array([m.sum(0) for m in left])
-        enough = (counts > least * np.array(outlines)[:, None]).any(0)
+        enough = (counts > LEAST_OBJECT * np.array(outlines)[:, None]).any(0)
         if not enough.any():
             return found
         best = int(np.argmax(np.where(enough, counts.sum(0), -1)))
@@ -247,12 +232,8 @@ def standing(
         left = [m[~m[:, best]] for m in left]
 
 
-def surface_in(
-    camera: Camera,
-    depth: np.ndarray,  # [H, W] z, 0 = nothing
-    region: Region,
-) -> np.ndarray:
-    """[H, W] bool: pixels whose first surface lies in the region."""
+def surface_in(camera: Camera, depth: np.ndarray, region: Region) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface (z in `depth` [H, W], 0 = nothing) lies in the region."""
     found = np.zeros(depth.shape, bool)
     for box in region:
         rows, cols, points = surface_points(camera, depth, box_window(box, camera))
@@ -260,21 +241,13 @@ def surface_in(
     return found
 
 
-def near_region(
-    gaussians: Gaussians,
-    region: Region,
-    near: float = NEAR,  # see _surrounds
-) -> np.ndarray:
+def near_region(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.ndarray:
     """[N] bool: rows of whose fate something but extra masks can decide."""
     return _reaches(gaussians, region) | _surrounds(gaussians, region, near)
 
 
-def weigh(
-    gaussians: Gaussians,
-    near: np.ndarray,  # [N] bool, see near_region
-    sightings: Sequence[Sighting],
-) -> Weights:
-    """Where each Gaussian shows while the object is there: one pass per view."""
+def weigh(gaussians: Gaussians, near: np.ndarray, sightings: Sequence[Sighting]) -> Weights:
+    """Where each Gaussian shows while the object is there: one pass per view. `near` [N] bool as by `near_region`."""
     empty = np.zeros((2, len(gaussians)))
 
     def of(view: Sighting) -> np.ndarray:
@@ -314,10 +287,7 @@ def select(
 
 
 def weigh_revealed(
-    gaussians: Gaussians,
-    selection: Selection,
-    near: np.ndarray,  # [N] bool, see near_region
-    sightings: Sequence[Sighting],
+    gaussians: Gaussians, selection: Selection, near: np.ndarray, sightings: Sequence[Sighting]
 ) -> np.ndarray:
     """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views.
 
@@ -335,14 +305,11 @@ def weigh_revealed(
 
 
 def without_revealed(
-    gaussians: Gaussians,
-    selection: Selection,
-    region: Region,
-    clear: np.ndarray,  # [N] weight on what views showed unhidden, with the object in place
-    revealed: np.ndarray,  # [N], see weigh_revealed
-    support: float,  # see SelectionSettings
+    gaussians: Gaussians, selection: Selection, region: Region, clear: np.ndarray, revealed: np.ndarray, support: float
 ) -> Selection:
-    """Remove what the removal reveals near the region and no photo vouches for (docs/method.md).
+    """Remove what the removal reveals near the region and no photo vouches for (docs/method.md): `revealed` [N] as by
+    `weigh_revealed`, `clear` [N] the weight on what views showed unhidden, with the object in place; `support` as in
+    SelectionSettings.
 
     Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them. Without
     this rule 21 to 63 of them stay in tiles_mug, desk, rocks and real_bed, which `clear_air` does not find either.

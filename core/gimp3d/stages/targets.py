@@ -6,19 +6,17 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SAME_DEPTH, SOLID, cropped, dilated, surface_points, window_round
 from ..raster import render
+from .growth import components
 from .look import AROUND, MOSTLY_OBJECT, ViewAfter, ViewBefore
 from .outline import guard_gaussians
 from .visibility import HIDES, SHOWN, Sight
 
-GUARD_SCALE = 1.2  # the guard band's size over the polygon's (paper 3.2, s)
 GUARD_FOOTPRINT = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill (paper 3.2)
 CHANGED = 0.02  # blend weight of removed Gaussians above which the object touched a pixel: five grey levels of 255
 VOID = 0.1  # alpha after removal below which there is nothing
@@ -30,23 +28,14 @@ EDGE = 3  # px that splats blur the edge of what stands before a void: else T is
 
 
 def all_needed(
-    before: Sequence[ViewBefore],
-    after: Sequence[ViewAfter],
-    centre: np.ndarray,  # [3] of the region
-    margin: int,  # px by which T grows
+    before: Sequence[ViewBefore], after: Sequence[ViewAfter], centre: np.ndarray, margin: int
 ) -> list[np.ndarray]:
-    """[H, W] bool each: the pixels to fill, judged by all views together."""
+    """[H, W] bool each: the pixels to fill, judged by all views; T grows by `margin` px; `centre` [3], the region's."""
     sight = Sight.make([(b.camera, b.depth, a.untrusted(b)) for b, a in zip(before, after)], centre)
     return parallel_map(lambda v: _needed(v[0].camera, v[1], sight, centre, margin), list(zip(before, after)))
 
 
-def _needed(
-    view: Camera,
-    after: ViewAfter,
-    sight: Sight,
-    centre: np.ndarray,
-    margin: int,
-) -> np.ndarray:
+def _needed(view: Camera, after: ViewAfter, sight: Sight, centre: np.ndarray, margin: int) -> np.ndarray:
     """[H, W] bool: pixels that the object touched and that now show nothing that a view saw.
 
     A sky that goes on beyond the object is as little a hole as a void. Half covered pixels at a void that counts as
@@ -78,17 +67,14 @@ def _needed(
 def uncovered(gaussians: Gaussians, removed: np.ndarray, view: ViewBefore) -> np.ndarray:
     """[H, W] bool: T as the paper defines it (3.2), the polygon less the guard Gaussians' footprints."""
     usable = ~removed & gaussians.usable
-    guards = [guard_gaussians(gaussians, usable, p, view.camera, GUARD_SCALE) for p in view.polygons]
+    guards = [guard_gaussians(gaussians, usable, p, view.camera) for p in view.polygons]
     covered = render(gaussians.take(np.any(guards, axis=0)), view.camera, passes=frozenset({"alpha"})).alpha
     return view.polygon & (covered <= GUARD_FOOTPRINT)
 
 
-def in_front(
-    depth: np.ndarray,  # [H, W] z with the object
-    object_: np.ndarray,  # [H, W] bool
-    reach: int,  # px round the object's outline that are looked at
-) -> np.ndarray:
-    """[H, W] bool: surface at the object's outline behind whose continuation the object lies, and a pixel round it.
+def in_front(depth: np.ndarray, object_: np.ndarray, reach: int) -> np.ndarray:
+    """[H, W] bool: surface at the outline of the object (`object_` [H, W] bool, z with it in `depth` [H, W]) behind
+    whose continuation the object lies, and a pixel round it. `reach` px round the outline are looked at.
 
     The continuation is a plane in disparity, level where the surface falls off on its other side. The floor before the
     object's foot rises to it and is not in front, however flat the view; a thin rod is, close as it may stand.
@@ -105,13 +91,10 @@ def in_front(
     return dilated(front & ~object_, 1)
 
 
-def continues_outside(
-    depth: np.ndarray,  # [H, W] z without the object, 0 = nothing
-    alpha: np.ndarray,  # [H, W]
-    touched: np.ndarray,  # [H, W] bool, by the object
-    distance: float,  # of the object, beyond which steps are of disparity, as for Sight
-) -> np.ndarray:
-    """[H, W] bool: surfaces, and the void of scans without a background, that go on beyond what the object touched.
+def continues_outside(depth: np.ndarray, alpha: np.ndarray, touched: np.ndarray, distance: float) -> np.ndarray:
+    """[H, W] bool: surfaces (z without the object, 0 = nothing, in `depth` [H, W]), and the void of scans without a
+    background, that go on beyond what the object `touched` [H, W] bool. Beyond the object's `distance` steps are of
+    disparity, as for Sight.
 
     What shows through a gap that a nearer surface encloses (the sky below a table that the box cut open) may be seen
     by other views past the table's edge, but it is not what was behind the object.
@@ -124,22 +107,16 @@ def continues_outside(
         low, high = np.minimum(z[near], z[far]), np.maximum(z[near], z[far])
         close = high - low < LAYER_STEP * low * np.maximum(1, high / distance)
         same = there[near] & there[far] & np.where(void[near], void[far], close & ~void[far])
-        pairs.append(np.stack([index[near][same], index[far][same]]))
-    a, b = np.concatenate(pairs, axis=1)
-    graph = scipy.sparse.coo_matrix((np.ones(len(a), bool), (a, b)), (z.size, z.size))
-    count, surface = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    surface = surface.reshape(z.shape)
-    outside = np.bincount(surface[there & ~touched], minlength=count)
+        pairs.append(np.stack([index[near][same], index[far][same]], axis=1))
+    surface = components(np.concatenate(pairs), z.size).reshape(z.shape)
+    outside = np.bincount(surface[there & ~touched], minlength=z.size)
     return there & (outside >= LEAST_OUTSIDE)[surface]
 
 
-def _tidy(
-    target: np.ndarray,  # [H, W] bool
-    certain: np.ndarray,  # [H, W] bool, where thin parts are no noise
-    allowed: np.ndarray,  # [H, W] bool, what the object touched
-    margin: int,
-) -> np.ndarray:
-    """Close pinholes, drop thin parts that are not certain, and grow by a margin within what the object touched."""
+def _tidy(target: np.ndarray, certain: np.ndarray, allowed: np.ndarray, margin: int) -> np.ndarray:
+    """Close a target's pinholes, drop thin parts that are not `certain`, and grow by a margin within what the object
+    touched (`allowed`); all [H, W] bool.
+    """
     solid = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     grown = dilated(solid, margin)

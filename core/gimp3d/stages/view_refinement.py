@@ -46,7 +46,6 @@ class RefinedView:
 
     camera_id: str
     image: np.ndarray | None  # [H, W, 3] uint8; None: refused, the view stays as it was
-    drift: float  # grey levels that the answer differs from the painting under a blur; NaN: not compared
     reason: str
 
 
@@ -75,10 +74,7 @@ class ViewRefinement:
 def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: Call) -> ViewRefinement:
     """Ask about one view after the other.
 
-    Raises
-    ------
-    BadInput
-        If the painter fails at the first view; later failures only refuse their view.
+    Raises BadInput if the painter fails at the first view; later failures only refuse their view.
     """
     asked = [view for view in views if int(_mask(view).sum()) >= LEAST]
     done: list[RefinedView] = []
@@ -90,7 +86,7 @@ def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: C
         except BadInput as error:
             if not done:
                 raise
-            done.append(RefinedView(view.camera_id, None, float("nan"), str(error)))
+            done.append(RefinedView(view.camera_id, None, str(error)))
     accepted = sum(v.image is not None for v in done)
     words = f"{accepted} of {len(done)} views refined by {who.who}" if done else "no view has anything to refine"
     return ViewRefinement(tuple(done), accepted / max(1, len(done)), words)
@@ -107,26 +103,23 @@ def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> Refi
     try:
         pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
     except BadInput as error:
-        return RefinedView(view.camera_id, None, float("nan"), str(error))
+        return RefinedView(view.camera_id, None, str(error))
     if pasted.warnings:
-        return RefinedView(view.camera_id, None, float("nan"), pasted.warnings[0])
+        return RefinedView(view.camera_id, None, pasted.warnings[0])
     drift = _drift(painted, pasted.image, mask)
     if drift > MOST_DRIFT:
         words = f"{who.who} painted something else: {drift:.0f} grey levels from what was propagated, under a blur"
-        return RefinedView(view.camera_id, None, drift, words)
+        return RefinedView(view.camera_id, None, words)
     whole = view.image.copy()
     whole[part] = pasted.image
-    return RefinedView(
-        view.camera_id, whole, drift, f"{drift:.0f} grey levels from what was propagated; {pasted.reason}"
-    )
+    words = f"{drift:.0f} grey levels from what was propagated; {pasted.reason}"
+    return RefinedView(view.camera_id, whole, words)
 
 
-def side_by_side(
-    reference: np.ndarray,  # [h', w', 3] uint8
-    view: np.ndarray,  # [h, w, 3] uint8
-    mask: np.ndarray,  # [h, w] bool
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """The reference left, as high as the view right; the mask, empty on the left; the column where right begins."""
+def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """The reference [h', w', 3] uint8 left, as high as the view [h, w, 3] uint8 right; the mask [h, w] bool, empty on
+    the left; the column where right begins.
+    """
     factor = min(1.0, LONGEST / max(mask.shape))
     height, width = (max(1, round(factor * side)) for side in mask.shape)
     beside = max(1, min(LONGEST, round(reference.shape[1] * height / reference.shape[0])))

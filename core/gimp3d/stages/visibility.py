@@ -15,6 +15,7 @@ from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import SAME_DEPTH, Window, framed, pack_camera, project, surface_points
 
+SAMPLES = 1000  # of each view's surface that are compared with another's, about
 HIDDEN = -1.0  # limit of a pixel that shows no surface but the object's
 HIDES, BURIED, SEEN_PAST, SHOWN = 0, 1, 2, 3  # what the views together say of a point, see Sight.of
 
@@ -28,27 +29,22 @@ class Sight:
     limits: np.ndarray  # float32, z of the first surface of every pixel; HIDDEN where there is none
 
     @classmethod
-    def make(
-        cls,
-        views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, untrusted pixels)
-        centre: np.ndarray,  # [3] of the object, scene coordinates
-    ) -> Sight:
-        """From depth maps [H, W], 0 = nothing, and masks [H, W] bool of the object and of what else hides the scene."""
-        order = [views[k] for k in _spread_order(len(views))]
-        away = [float(np.linalg.norm(c.centre - centre)) for c, _, _ in order]
-        packed = [np.append(pack_camera(c), far) for (c, _, _), far in zip(order, away)]
+    def make(cls, views: Sequence[tuple[Camera, np.ndarray, np.ndarray]], centre: np.ndarray) -> Sight:
+        """From views' depth maps with the object [H, W], 0 = nothing, and masks [H, W] bool of the object and of what
+        else hides the scene; `centre` [3] is the object's, in scene coordinates.
+        """
+        # Neighbouring views see the same: any first few of the order are spread evenly.
+        order = [views[k] for k in sorted(range(len(views)), key=lambda k: (k * 0.6180339887498949) % 1.0)]
+        packed = [np.append(pack_camera(c), np.linalg.norm(c.centre - centre)) for c, _, _ in order]
         limits = [np.where(hidden | (z <= 0), HIDDEN, z).astype(np.float32).ravel() for _, z, hidden in order]
         sizes = np.array([len(part) for part in limits], np.int64)
         return cls(np.array(packed), np.cumsum(sizes) - sizes, np.concatenate(limits))
 
-    def of(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-        tolerance: float,  # relative z, up to the centre's distance; beyond it, of disparity times that distance
-    ) -> np.ndarray:
-        """[N] uint8: SHOWN if the point is the first surface of some view, which is not hidden there; SEEN_PAST if it
-        is not, and some view sees a surface behind it; BURIED if it lies behind surfaces in most views, so that it is
-        on none; else HIDES: the object alone hides it.
+    def of(self, points: np.ndarray, tolerance: float) -> np.ndarray:
+        """[N] uint8 of points [N, 3] in scene coordinates: SHOWN if the point is the first surface of some view, which
+        is not hidden there; SEEN_PAST if it is not, and some view sees a surface behind it; BURIED if it lies behind
+        surfaces in most views, so that it is on none; else HIDES: the object alone hides it. The tolerance is of z
+        (relative) up to the centre's distance, beyond it of disparity times that distance.
 
         What is far away moves little between views, so depths there are little certain, and need not be: a sky's splats
         lie anywhere. A difference of disparity shifts pixels by the same amount at every distance.
@@ -59,16 +55,9 @@ class Sight:
         return found
 
 
-def depth_agreement(
-    cameras: Sequence[Camera],
-    depths: Sequence[np.ndarray],  # [H, W] z each, 0 = nothing
-    windows: Sequence[Window],  # the parts to look at
-    tolerance: float = SAME_DEPTH,  # relative z
-    samples: int = 1000,  # per view
-) -> float:
-    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too.
-
-    1 where nothing can be compared.
+def depth_agreement(cameras: Sequence[Camera], depths: Sequence[np.ndarray], windows: Sequence[Window]) -> float:
+    """Share of the surface which, framed by a neighbouring view and not hidden there, is that view's surface too; 1
+    where nothing can be compared. Looked at are the windows of the depth maps [H, W], 0 = nothing.
     """
     centres = np.array([c.centre for c in cameras])
     forwards = np.array([c.forward for c in cameras])
@@ -79,9 +68,9 @@ def depth_agreement(
         apart[k] = np.inf
         other = int(apart.argmin())
         _, _, points = surface_points(cameras[k], depths[k], windows[k])
-        _, rows, cols, z = framed(cameras[other], points[:: max(1, len(points) // samples)])
+        _, rows, cols, z = framed(cameras[other], points[:: max(1, len(points) // SAMPLES)])
         there = depths[other][rows, cols]
-        coarse = max(tolerance, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
+        coarse = max(SAME_DEPTH, 1 / cameras[other].fx)  # a pixel of a small picture holds many depths
         through = (there > z * (1 + coarse)) | (there == 0)
         return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
 
@@ -89,11 +78,6 @@ def depth_agreement(
         return 1.0
     same, through = np.sum(parallel_map(compared, range(len(cameras))), axis=0)
     return float(same / (same + through)) if same + through else 1.0
-
-
-def _spread_order(count: int) -> list[int]:
-    """0 … count−1 so that any first few are spread evenly: neighbouring views see the same."""
-    return sorted(range(count), key=lambda k: (k * 0.6180339887498949) % 1.0)
 
 
 @exact_kernel

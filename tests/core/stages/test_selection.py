@@ -154,10 +154,10 @@ def test_overlapping_boxes_are_their_union() -> None:
 def test_the_objects_foot_in_a_shadows_box_makes_it_no_object() -> None:
     foot, body, other = [True, True, False], [True, False, False], [False, False, True]
     views = [np.array([foot] * 30 + [body] * 50), np.array([foot] * 5 + [body] * 90 + [other] * 3)]
-    assert standing(views, [1000, 1000], 0.002) == [True, False, True]
-    assert standing(views, [1000, 2000], 0.002) == [True, False, False]  # three pixels of 2000 are too few
-    assert standing([np.array([foot] * 9)], [1000], 0.002) == [True, False, False]  # of equal boxes one is enough
-    assert standing([np.zeros((0, 3), bool)], [1000], 0.002) == [False] * 3
+    assert standing(views, [1000, 1000]) == [True, False, True]
+    assert standing(views, [1000, 2000]) == [True, False, False]  # three pixels of 2000 are too few
+    assert standing([np.array([foot] * 9)], [1000]) == [True, False, False]  # of equal boxes one is enough
+    assert standing([np.zeros((0, 3), bool)], [1000]) == [False] * 3
 
 
 def test_a_box_round_a_shadow_takes_its_floor_and_masks_it() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
-from ...geometry import EVIDENCE_DEPTH, bounds, cropped
+from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
 from ...progress import Progress, silent
 from ...solvers.colours import NO_CHANGE
 from .blend import blend_band, to_bytes
@@ -23,20 +23,6 @@ from .paper import Lent, Mapped, Sources, blend_rim, lent_colours, sampled
 from .transfer import flat, learned_change
 from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
 from .warp import Picture, picture_of, warp_reference
-
-__all__ = [
-    "Loader",
-    "PaintedView",
-    "PropagateSettings",
-    "Propagation",
-    "Reference",
-    "Rule",
-    "ViewToPaint",
-    "blend_band",
-    "blend_rim",
-    "near_hole",
-    "propagate",
-]
 
 TRANSFERS = ("learned", "sample", "none")
 BLENDS = ("band", "rim")
@@ -68,10 +54,7 @@ def propagate(
 
     As many views are in memory as threads work on them; what is kept of each is the part round its hole.
 
-    Raises
-    ------
-    BadInput
-        If the transfer or the blend is unknown.
+    Raises BadInput if the transfer or the blend is unknown.
     """
     for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
         if value not in known:
@@ -110,7 +93,7 @@ def _painted(
         return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
     reach = _reach(view.target)
     near, top, left = _cropped(view, reach)
-    same = _same_surface(near)
+    same = same_surface(near.depth_before, near.depth_new, EVIDENCE_DEPTH)  # the photo's surface is the new one
     evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
     hole = near.target & ~evidence
     base = np.where(evidence[..., None], near.image, near.base)
@@ -152,9 +135,3 @@ def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
     part = bounds(view.target, margin)
     arrays = (getattr(view, f.name)[part] for f in fields(view) if f.name != "camera")
     return ViewToPaint(cropped(view.camera, part), *arrays), part[0].start, part[1].start
-
-
-def _same_surface(view: ViewToPaint) -> np.ndarray:
-    """[H, W] bool: the photo's surface is the new one."""
-    near = np.abs(view.depth_before - view.depth_new) < EVIDENCE_DEPTH * view.depth_new
-    return (view.depth_before > 0) & (view.depth_new > 0) & near

@@ -27,17 +27,7 @@ RADIUS = 2  # px of the overlapping patches that are compared and blended (paper
 ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source is alike
 OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
 
-
 Sources = tuple[np.ndarray, np.ndarray]  # see propagate
-
-
-@dataclass(frozen=True)
-class Shown:
-    """Where a view shows the patches that explain the mapped pixels."""
-
-    rows: np.ndarray  # [M] int32 in the reference: the field's, or found near it
-    cols: np.ndarray
-    rules: np.ndarray  # [M] uint8: OWN, RETARGETED, or 0 where the view shows none
 
 
 @dataclass(frozen=True)
@@ -61,17 +51,16 @@ class Mapped:
         to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in sources)
         return cls(reference, picture_of(reference), rows, cols, to_rows, to_cols, index)
 
-    def shown_in(self, view: Picture, reach: int) -> Shown:
-        """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not.
+    def shown_in(self, view: Picture, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not:
+        rows and columns [M] int32 in the reference; rules [M] uint8 OWN, RETARGETED, or 0 where the view shows none.
 
         Patches are compared in the reference, where one camera sees both; the view only says which of them it shows.
         """
-        rows, cols = self.source_rows.copy(), self.source_cols.copy()
-        rules = np.zeros(len(rows), np.uint8)
-        worst = 3 * ALIKE**2
-        places, found = (self.rows, self.cols), (rows, cols, rules)
-        run_ranges(_find_range, len(rows), *places, self.picture, view, SAME_DEPTH, RADIUS, reach, worst, *found)
-        return Shown(rows, cols, rules)
+        found = self.source_rows.copy(), self.source_cols.copy(), np.zeros(len(self.rows), np.uint8)
+        given = self.rows, self.cols, self.picture, view, SAME_DEPTH, RADIUS, reach, 3 * ALIKE**2
+        run_ranges(_find_range, len(self.rows), *given, *found)
+        return found
 
 
 @dataclass(frozen=True)
@@ -92,44 +81,43 @@ def lent_colours(mapped: Mapped, views: Sequence[Loader], settings: PropagateSet
 
 
 def sampled(
-    mapped: Mapped,
-    view: ViewToPaint,
-    lent: Sequence[Lent],
-    warp: Warp,
-    rules: np.ndarray,  # [h, w] uint8, REFERENCE where the warp reaches the hole
-    retarget: int,  # px
+    mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], warp: Warp, rules: np.ndarray, retarget: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole."""
-    sources = mapped.shown_in(picture_of(view), retarget)
+    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole. `rules` [h, w] uint8 come in as
+    REFERENCE where the warp reaches the hole; `retarget` is in px.
+    """
+    *sources, source_rules = mapped.shown_in(picture_of(view), retarget)
     reached = rules == Rule.REFERENCE
-    found = np.append(sources.rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
+    found = np.append(source_rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
     raw, rules = warp.colours.copy(), rules.copy()
     rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
     rows, cols = np.nonzero(reached)
     places = rows, cols, warp.u, warp.v
-    taken = mapped.index, sources.rows, sources.cols, sources.rules, *_borrowed(mapped, view, sources, lent)
+    taken = mapped.index, *sources, source_rules, *_borrowed(mapped, view, source_rules == 0, lent)
     pictures = mapped.picture, picture_of(view)
     run_ranges(_sample_range, len(rows), *places, *taken, *pictures, SAME_DEPTH, RADIUS, raw, rules)
     return raw, rules
 
 
-def _borrowed(mapped: Mapped, view: ViewToPaint, sources: Shown, lent: Sequence[Lent]) -> tuple[np.ndarray, np.ndarray]:
-    """[M, 3] colours of the sources by the nearest view that shows them, at this view's exposure; [M] bool: there."""
-    colours, has = np.zeros((len(sources.rows), 3), np.float32), np.zeros(len(sources.rows), bool)
+def _borrowed(
+    mapped: Mapped, view: ViewToPaint, wanted: np.ndarray, lent: Sequence[Lent]
+) -> tuple[np.ndarray, np.ndarray]:
+    """[M, 3] colours of wanted sources in the nearest view that shows them, at this exposure; [M] bool: there."""
+    colours, has = np.zeros((len(wanted), 3), np.float32), np.zeros(len(wanted), bool)
     others = sorted(
         (x for x in lent if x.camera.id != view.camera.id),
         key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id),
     )
     gain = _lend(mapped, view).gain if others else np.ones(3)
     for other in others:
-        new = other.seen & (sources.rules == 0) & ~has
+        new = other.seen & wanted & ~has
         colours[new] = other.colours[new] * (gain / other.gain)
         has |= new
     return colours, has
 
 
 def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
-    seen = mapped.shown_in(picture_of(view), reach=0).rules > 0
+    seen = mapped.shown_in(picture_of(view), reach=0)[2] > 0
     reference, camera = mapped.reference, view.camera
     rows, cols = mapped.source_rows[seen], mapped.source_cols[seen]
     points = reference.camera.unproject(
@@ -141,13 +129,11 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
 
 
 def blend_rim(
-    base: np.ndarray,  # [H, W, 3] uint8, the view round the hole
-    raw: np.ndarray,  # [H, W, 3] float32, the fill
-    painted: np.ndarray,  # [H, W] bool, where the fill is
-    no_photo: np.ndarray,  # [H, W] bool, what bounds no fill: the rest of the hole, renderings of the emptied scene
-    depth: np.ndarray,  # [H, W] z of the new scene
+    base: np.ndarray, raw: np.ndarray, painted: np.ndarray, no_photo: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """The paper's blend: gradients of the fill, its rim as in the view, [H, W, 3] uint8.
+    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32, its rim as in the view `base`
+    [H, W, 3] uint8. `painted` [H, W] bool is where the fill is, `no_photo` [H, W] bool what bounds none: the rest of
+    the hole, renderings of the emptied scene; `depth` [H, W] is z of the new scene.
 
     The rim counts only where no depth seam parts it from the fill. Parts without a rim keep their own colours.
     """

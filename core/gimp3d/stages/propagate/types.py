@@ -77,12 +77,8 @@ class PaintedView:
     rules: np.ndarray  # [h, w] uint8, see Rule
     depth: np.ndarray  # [h, w] z of the scene with the new surface
 
-    def pasted(
-        self,
-        picture: np.ndarray,  # [H, W, 3] uint8
-        part: np.ndarray | None = None,  # [h, w, 3] uint8, e.g. `raw`; default: `image`
-    ) -> np.ndarray:
-        """The whole view: this part's hole in the picture, [H, W, 3]."""
+    def pasted(self, picture: np.ndarray, part: np.ndarray | None = None) -> np.ndarray:
+        """The picture [H, W, 3] uint8, this part's hole pasted in: from `part` [h, w, 3], by default `image`."""
         whole = picture.copy()
         h, w = self.rules.shape
         place = whole[self.top : self.top + h, self.left : self.left + w]

@@ -59,13 +59,10 @@ class Warp:
         return picture[self.v[where].astype(int), self.u[where].astype(int)]
 
 
-def warp_reference(
-    reference: Picture,
-    camera: Camera,  # of the part of a view
-    depth: np.ndarray,  # [h, w] float32, z of its new surface
-    wanted: np.ndarray,  # [h, w] bool
-) -> Warp:
-    """The reference's colours at the wanted pixels of a view, and the places they come from."""
+def warp_reference(reference: Picture, camera: Camera, depth: np.ndarray, wanted: np.ndarray) -> Warp:
+    """The reference's colours at the `wanted` [h, w] bool pixels of a part of a view, and the places they come from.
+    `camera` is the part's, `depth` [h, w] float32 z of its new surface.
+    """
     rows, cols = np.nonzero(wanted)
     colours = np.zeros((*wanted.shape, 3), np.float32)
     u, v = np.full((2, *wanted.shape), np.nan)
