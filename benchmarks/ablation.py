@@ -87,6 +87,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
+    "no edge turns a corner, nor ends unseen": (("gimp3d.solvers.edges:_joined", lambda *_: []),),
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
     "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, 0, 0, 0])),),
     "averages of patches stay": (("gimp3d.solvers.exemplar:COPIED", 0.0), ("gimp3d.solvers.exemplar:MOSAICS", 0)),

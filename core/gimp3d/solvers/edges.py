@@ -1,10 +1,13 @@
 """Straight edges that a hole cuts: each is told on both sides of it, and runs straight on in between.
 
+One that is told on one side only runs on until it meets another of the same corner, or what is not known.
+
 What is large is continued before what is small (structure propagation: Sun, Yuan, Jia and Shum 2005).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +22,7 @@ ANGLE = 2.0  # degrees between directions that are tried
 REACH, LEAST = 40, 12  # known px on either side of the hole that tell an edge: at most, at least
 FURTHEST = 3  # times REACH, from the hole, where they lie at most
 TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
+HALF_TELLS = 8.0  # where it is told on one side only: among all lines noise alone comes to 7
 STEEP = 4.0  # grey levels that it must be
 CLUMPED = 4.0  # by which textures' noise exceeds that of independent pixels, squared
 LIKE = 0.7  # cosine between the steps on both sides
@@ -31,6 +35,8 @@ BLOCK = 8  # px, in each of which it is that further off, as far as it goes
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
 MOST = 8  # edges of a part of the hole
+BOTH, BEFORE, AFTER = range(3)  # the sides of the hole on which an edge is told
+TURN = 0.5  # sine of the angle that two edges that meet have at least
 
 
 @dataclass(frozen=True)
@@ -70,28 +76,82 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
     there = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     open_ = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
     angles = np.arange(0, 180, ANGLE)
-    told = np.array(parallel_map(lambda a: _steps(small, there, open_, a, scale), angles))  # [angles, rows]
+    told = np.array(parallel_map(lambda a: _steps(small, there, open_, a, scale), angles))  # [angles, sides, rows]
+    heart = (told.shape[2] - 1) / 2
     middle = (np.array(size) - 1) / 2
     places = np.argwhere(open_)[:, ::-1] - middle
-    found: list[Edge] = []
-    for _ in range(MOST):
-        k, row = np.unravel_index(int(told.argmax()), told.shape)
-        if told[k, row] <= 0:
+    whole: list[Edge] = []
+    halves: list[_Half] = []
+    for number in range(2 * MOST):
+        sides = slice(BOTH, BOTH + 1) if number < MOST and told[:, BOTH].any() else slice(BEFORE, AFTER + 1)
+        k, side, row = (int(n) for n in np.unravel_index(told[:, sides].argmax(), told[:, sides].shape))
+        side += sides.start
+        if told[k, side, row] <= 0:
             break
         along, across = _axes(angles[k])
-        offset = row - (told.shape[1] - 1) / 2
+        offset = row - heart
         cut = (places @ along)[np.abs(places @ across - offset) <= 1]
-        ends = offset * across + np.outer((cut.min(), cut.max()), along)
-        for other, angle in enumerate(angles):
-            off = ends @ _axes(angle)[1] + (told.shape[1] - 1) / 2
-            beside = np.abs(np.arange(told.shape[1])[:, None] - off) <= max(1.5, APART * scale)
-            told[other, beside.any(1)] = 0
+        edge = None
         if cut.max() - cut.min() >= LEAST_CUT * scale:
             place = ((offset * across + middle) + 0.5) / scale - 0.5
-            edge = _settled(picture, known, hole, angles[k], place)
-            if edge is not None:
-                found.append(replace(edge, origin=edge.origin + corner))
-    return found
+            edge = _settled(picture, known, hole, angles[k], place, side)
+        if isinstance(edge, Edge):
+            whole.append(edge)
+        elif edge is not None:
+            halves.append(edge)
+        ways = (cut.min(), along), (cut.max(), -along)
+        for end, inwards in (ways, ways[:1], ways[1:])[side]:
+            place = offset * across + end * along
+            for other, angle in enumerate(angles):
+                axes = _axes(angle)
+                beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
+                here = BEFORE if inwards @ axes[0] > 0 else AFTER
+                told[other, [[BOTH], [here if edge is not None or side != BOTH else BOTH]], beside] = 0
+    return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *_joined(halves, hole)]]
+
+
+@dataclass(frozen=True)
+class _Half:
+    """An edge that is told on one side of the hole only."""
+
+    edge: Edge
+    enters: float  # px along it, where it runs into the hole
+    leaves: float  # and out of it
+    goes_on: bool  # what is known beyond the hole does not tell that it ends
+
+    @property
+    def inwards(self) -> float:
+        return 1.0 if self.leaves > self.enters else -1.0
+
+    def until(self, t: float) -> Edge:
+        outer = self.edge.ends[0 if self.inwards > 0 else 1]
+        return replace(self.edge, ends=(min(outer, t), max(outer, t)))
+
+
+def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
+    """Pairs as far as the corner in the hole at which they meet, nearest first; others as far as what is not known."""
+    meetings = []
+    for (k, one), (j, other) in itertools.combinations(enumerate(halves), 2):
+        a, b = one.edge, other.edge
+        turn = a.along[0] * b.along[1] - a.along[1] * b.along[0]
+        # round a corner what lies to the right of the way in lies to the right of the way out
+        steps = one.inwards * a.step, -other.inwards * b.step
+        if abs(turn) < TURN or np.linalg.norm(steps[0] - steps[1]) > STEADY * max(np.linalg.norm(s) for s in steps):
+            continue
+        apart = b.origin - a.origin
+        t, u = ((apart[0] * d[1] - apart[1] * d[0]) / turn for d in (b.along, a.along))
+        x, y = np.rint(a.origin + t * a.along).astype(int)
+        ways = (t - one.enters) * one.inwards, (u - other.enters) * other.inwards
+        if min(ways) >= 0 and 0 <= y < hole.shape[0] and 0 <= x < hole.shape[1] and hole[y, x]:
+            meetings.append((sum(ways), {k: one.until(t), j: other.until(u)}))
+    found: dict[int, Edge] = {}
+    for _, pair in sorted(meetings, key=lambda m: m[0]):
+        if not found.keys() & pair.keys():
+            found |= pair
+    for k, half in enumerate(halves):
+        if k not in found and half.goes_on and abs(half.leaves - half.enters) >= LEAST:
+            found[k] = half.until(half.leaves)
+    return list(found.values())
 
 
 def _axes(angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -101,7 +161,7 @@ def _axes(angle: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, scale: float) -> np.ndarray:
-    """[rows] of the picture turned by the angle: by how many times its noise colours change there, on both sides."""
+    """[3, rows] of the picture turned by the angle: times of its noise that colours change there, by side."""
     h, w = hole.shape
     along, across = _axes(angle)
     side = math.ceil(math.hypot(h, w)) | 1
@@ -113,7 +173,7 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
     open_ = cv2.warpAffine(hole.astype(np.float32), matrix, (side, side), flags=flags) > 0.5
     rows = np.flatnonzero(open_.any(1))
     if not len(rows):
-        return np.zeros(side)
+        return np.zeros((3, side))
     open_, shown, turned = open_[rows], shown[rows], turned[rows].astype(np.float64)
     weight = shown[..., None].astype(np.float64)
     sums = np.concatenate([weight, turned * weight, turned**2 * weight], axis=-1).cumsum(1)
@@ -129,7 +189,9 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
         whole = np.zeros((side, 7))
         whole[rows] = sums[number, hi] - sums[number, lo]
         sides.append(whole)
-    return _told([(_above(s), _below(s)) for s in sides], 2 * LEAST * scale)
+    pairs = [(_above(s), _below(s)) for s in sides]
+    both, *halves = (_told(told, 2 * LEAST * scale) for told in (pairs, pairs[:1], pairs[1:]))
+    return np.stack([both, *(np.where(half >= HALF_TELLS, half, 0.0) for half in halves)])
 
 
 def _above(rows: np.ndarray) -> np.ndarray:
@@ -155,25 +217,29 @@ def _told(sides: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> np.nd
             steps.append(means[1] - means[0])
             size = np.linalg.norm(steps[-1], axis=1)
             told = np.minimum(told, np.where(size >= STEEP, size / np.sqrt(noise), 0))
-        alike = (steps[0] * steps[1]).sum(1) > LIKE * np.prod([np.linalg.norm(s, axis=1) for s in steps], axis=0)
+        alike = (steps[0] * steps[-1]).sum(1) > LIKE * np.prod(
+            [np.linalg.norm(s, axis=1) for s in (steps[0], steps[-1])], axis=0
+        )
     return np.where(enough & alike & (told >= TELLS), told, 0.0)
 
 
-def _settled(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray) -> Edge | None:
+def _settled(
+    picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray, side: int
+) -> Edge | _Half | None:
     """The edge at full resolution: turned and shifted to where it is told best (pattern search: Hooke 1961)."""
     rows, cols = np.nonzero(hole)
     pixels = np.stack([cols, rows], 1).astype(np.float64)
     shows = known.astype(np.float32)
     heart = place + ((pixels - place) @ _axes(angle)[0]).mean() * _axes(angle)[0]
 
-    def at(values: np.ndarray) -> tuple[float, Edge | None]:
+    def at(values: np.ndarray) -> tuple[float, Edge | _Half | None]:
         along, across = _axes(angle + values[0])
         origin = heart + values[1] * across
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
         if not len(cut):
             return 0.0, None
-        sides, ends, steady = [], [], True
-        for start, step in ((cut.min() - 1, -1), (cut.max() + 1, 1)):
+        sides, ends, steady, dark = [], [], True, False
+        for number, (start, step) in enumerate(((cut.min() - 1, -1), (cut.max() + 1, 1))):
             t = start + step * np.arange(FURTHEST * REACH)
             grid = origin + t[None, :, None] * along + ROWS[:, None, None] * across
             x, y = np.ascontiguousarray(grid.transpose(2, 0, 1), np.float32)
@@ -181,12 +247,21 @@ def _settled(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: fl
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             sums = np.concatenate([np.ones_like(colours[..., :1]), colours, colours**2], -1) * there
             near = sums * (there.cumsum(1) <= REACH)
-            sides.append(tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW)))
-            steady = steady and _is_edge(near)
+            pair = tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW))
+            if side not in (BOTH, BEFORE + number):
+                dark = min(p[0, 0] for p in pair) < 2 * LEAST
+                ends.append(start)
+                continue
+            sides.append(pair)
+            steady = steady and _is_edge(near) and (side == BOTH or _is_border(near))
             ends.append(float(t[_length(sums, _step(near))]))
         told = float(_told(sides, 2 * LEAST)[0])
         means = [[s[0, 1:4] / max(s[0, 0], 1) for s in pair] for pair in sides]
-        return told, Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1))) if steady else None
+        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)))
+        if not steady or side == BOTH:
+            return told, edge if steady else None
+        way = (cut.min(), cut.max()) if side == BEFORE else (cut.max(), cut.min())
+        return told, _Half(edge, float(way[0]), float(way[1]), dark)
 
     values, step = np.zeros(2), 1.0
     best = at(values)
@@ -220,6 +295,12 @@ def _is_edge(sums: np.ndarray) -> bool:
     sharp = size**2 >= SHARP * (_step(sums, FAR_ABOVE, FAR_BELOW) @ whole)
     near = each[:CLOSEST]
     return bool(sharp and near.min() >= STEADY * np.median(near))
+
+
+def _is_border(sums: np.ndarray) -> bool:
+    """Whether it parts two regions: a thin line, or one of a texture's, has the same colours further off again."""
+    whole = _step(sums)
+    return bool(_step(sums, FAR_ABOVE, FAR_BELOW) @ whole >= STEADY * (whole @ whole))
 
 
 def _length(sums: np.ndarray, whole: np.ndarray) -> int:

@@ -59,13 +59,44 @@ def test_what_hides_some_of_an_edge_is_looked_past() -> None:
         *(textured(np.full((SIDE, SIDE), 128.0), 30, size, seed) for size in (1, 3, 8) for seed in range(3)),
         textured(128 + 0.6 * side_of(20, 0), 3),  # a slope
         textured(128 + 40 * np.sin((side_of(0, 0) + 6 * np.sin(X / 13)) / 9), 3),  # waves
-        textured(np.where(side_of(0, 0) * (X > 0) > 0, 150.0, 100.0), 8),  # an edge on one side only
+        textured(np.where((side_of(0, 0) > 0) & (X > 45), 150.0, 100.0), 8),  # a corner before the hole
         textured(np.where(side_of(0, np.where(X > 0, 20, -20)) > 0, 150.0, 100.0), 8),  # two that miss each other
-        textured(np.where((side_of(0, 0) > 0) ^ (X > 0), 150.0, 100.0), 8),  # opposite steps
+        textured(np.where((np.abs(Y) < 2) & (X > 0) | (np.abs(X) < 2) & (Y > 0), 90.0, 150.0), 8),  # lines that meet
+        textured(128 + 40.0 * (side_of(0, 0) > 0) * np.clip(X / 60, 0, 1), 8),  # one that fades out towards the hole
     ],
 )  # fmt: skip
 def test_nothing_else_is_a_straight_edge(picture: np.ndarray) -> None:
-    assert all(abs(np.degrees(math.atan2(e.along[1], e.along[0]))) > 60 for e in found(picture))  # the upright X = 0 is
+    assert not found(picture)
+
+
+def run(edges, corner: tuple[float, float], directions: list[int]) -> bool:  # type: ignore[no-untyped-def]
+    """Edges end at a place (x, y), one in each direction in degrees, and there are no others."""
+    told = []
+    for e in edges:
+        ends = np.array([e.origin + t * e.along - MIDDLE for t in e.ends])
+        away = np.hypot(*(ends - corner).T)
+        assert away.min() < 3
+        told.append(math.degrees(math.atan2(*(ends[away.argmax()] - corner)[::-1])))
+    off = np.abs((np.array(directions)[:, None] - np.array(told) + 180) % 360 - 180)
+    return len(told) == len(directions) and bool((off.min(0) < 4).all() and (off.min(1) < 4).all())
+
+
+@pytest.mark.parametrize("turned", [0, 30, 75])
+@pytest.mark.parametrize("corner", [(0, 0), (9, -12)])
+def test_two_edges_that_are_told_on_one_side_each_meet_in_a_corner(turned: int, corner: tuple[int, int]) -> None:
+    a = math.radians(turned)
+    below = math.cos(a) * (Y - corner[1]) - math.sin(a) * (X - corner[0]) > 0
+    beyond = math.cos(a) * (X - corner[0]) + math.sin(a) * (Y - corner[1]) > 0
+    edges = found(textured(np.where(below & beyond, 150.0, 100.0), 8))
+    assert run(edges, corner, [turned, turned + 90])
+    checks = found(textured(np.where(below ^ beyond, 150.0, 100.0), 8))
+    assert run(checks, corner, [turned + t for t in (0, 90, 180, 270)])
+
+
+def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
+    picture, known = textured(np.where(side_of(0, 3) > 0, 150.0, 100.0), 8), ~HOLE & (X < 25)
+    edges = find_edges(np.where(known[..., None], picture, np.uint8(0)), HOLE, known)
+    assert len(edges) == 1 and edges[0].origin[0] + edges[0].along[0] * max(edges[0].ends) > MIDDLE + 25
 
 
 def test_pixels_of_one_guide_lie_at_one_distance() -> None:
