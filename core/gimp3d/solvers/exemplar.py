@@ -198,7 +198,7 @@ def _filled(
     """
     hole, allowed, radius = level.hole, level.allowed, level.radius
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
-    guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
+    guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
     matching, reach = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps), REACH
     if coarser is None:
         rows, cols = fill_inwards(
@@ -222,7 +222,7 @@ def _filled(
     def matched(
         field: NearestNeighbourField, colours: np.ndarray, number: int
     ) -> tuple[NearestNeighbourField, np.ndarray]:
-        repaint(patches, colours[:, :3])
+        repaint(colours[:, :3])
         guides[hole] = colours[:, 3:]
         field = refined(
             field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,

@@ -16,8 +16,8 @@ from ...solvers.planes import RING
 from ...solvers.poisson import solve_poisson
 from ..masks import ViewMasks
 from .evidence import AGREEMENT, DepthEvidence, gather_depth_evidence
-from .fill import HOLD_OUT, DepthSettings, Measured, choose_plan, fill, hold_out_miss, measure
-from .layers import AROUND, BAND, distance_to, without_front
+from .fill import HOLD_OUT, DepthSettings, Measured, choose_plan, fill, hold_out_miss
+from .layers import AROUND, BAND, background_rim, distance_to, without_front
 from .prior import PriorFit, fit_prior
 
 LEAST_ISLAND = 0.02  # share of the hole that evidence must hold to stand alone before the surface
@@ -62,11 +62,11 @@ def complete_depth(
     IllPosed
         As `complete_disparity`.
     """
-    known = without_front(disparity, known, view.target, view.occluder, step=settings.layer_step)
+    known = without_front(disparity, known, view.target, view.occluder, settings.layer_step)
     ring = known & (distance_to(view.target) <= RING)
     measured = gather_depth_evidence(view, views, ring)
     fallen = ring & (disparity < (1 - AGREEMENT) * measured.disparity)
-    known = without_front(disparity, known, view.target, fallen, MOSTLY, settings.layer_step) & ~fallen
+    known = without_front(disparity, known, view.target, fallen, settings.layer_step, MOSTLY) & ~fallen
     evidence = _without(measured, ~view.target)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
 
@@ -130,12 +130,14 @@ def complete_disparity(
     if evidence is not None:
         usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
         weight[usable], scene[usable] = evidence.weight[usable], evidence.disparity[usable]
-    around = measure(scene, trusted, hole, weight, settings)
-    guide, fit, on_line = None, PriorFit(0.0, 0.0, 1.0, ""), trusted
+    around = Measured(scene, background_rim(scene, trusted, hole, settings.layer_step), hole, weight)
+    guide, fit, sources = None, PriorFit(0.0, 0.0, 1.0, ""), [trusted]
     if prior is not None:
         fit = fit_prior(scene, around.measured, hole, prior, settings, on_ring=bool(around.touching.any()))
         if fit.scale:
-            guide, on_line = fit.guide_scale * _without_gaps(prior), trusted & fit.agrees(prior, scene)
+            gaps = ~np.isfinite(prior)
+            whole = solve_poisson(gaps, ~gaps, prior).values
+            guide, sources = fit.scale / fit.believed * whole, [trusted, trusted & fit.agrees(prior, scene)]
     if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     result, trust = scene.copy(), np.ones(hole.shape)
@@ -144,10 +146,9 @@ def complete_disparity(
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = bounds(part, RING + 1) if near else np.s_[:, :]
         inside, evident = part[window], (weight * part)[window]
-        alone = measure(scene[window], trusted[window], inside, evident, settings)
-        guided = None
-        if guide is not None:
-            guided = measure(scene[window], on_line[window], inside, evident, settings, guide[window])
+        rims = [background_rim(scene[window], a[window], inside, settings.layer_step) for a in sources]
+        alone = Measured(scene[window], rims[0], inside, evident)
+        guided = None if guide is None else replace(alone, rim=rims[1], guide=guide[window])
         own = replace(settings, surface="harmonic") if part.sum() <= settings.small_part else settings
         found = _completed_part(alone, guided, fit, own, first=not done)
         result[window][inside], trust[window][inside] = found.disparity[inside], found.trust[inside]
@@ -155,7 +156,7 @@ def complete_disparity(
     confidence = min([float(trust[hole].mean()), *(p.sure for p in done if p.pixels > LARGE * hole.sum())])
     reasons = [fit.reason, *(note for part in done for note in part.notes)]
     reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
-    used = fit.scale if guide is None else done[0].believed * fit.guide_scale
+    used = fit.scale if guide is None else done[0].believed * (fit.scale / fit.believed)
     fit = replace(fit, scale=used, confidence=confidence, reason=reason)
     return _completion(result, fit, trust, sum(part.clamped for part in done))
 
@@ -218,16 +219,12 @@ def _clamped(filled: np.ndarray, around: Measured) -> tuple[np.ndarray, int]:
 
 
 def _as_far_as_believed(
-    filled: np.ndarray,  # [H, W] the hole's disparity with the prior
-    missed: float,  # by it on the hold-out band
-    fit: PriorFit,
-    guided: Measured,
-    alone: Measured,  # without the prior
-    settings: DepthSettings,
+    filled: np.ndarray, missed: float, fit: PriorFit, guided: Measured, alone: Measured, settings: DepthSettings
 ) -> tuple[np.ndarray, float]:
     """The hole with as much of the prior as its fit and its miss on a hold-out band allow, and how much that is.
 
-    The fit tells a prior's scale, but not that its error is larger than what planes or a plate miss without it.
+    `filled` [H, W] is the hole's disparity with the prior, `alone` what is measured without it. The fit tells a prior's
+    scale, but not that its error is larger than what planes or a plate miss without it.
     """
     if settings.scale_factor is not None:
         return filled, fit.believed
@@ -244,12 +241,6 @@ def _as_far_as_believed(
 def _falling(ratio: float) -> float:
     """From 1 to 0, ½ at a ratio of 1."""
     return 1 / (1 + ratio**8)
-
-
-def _without_gaps(prior: np.ndarray) -> np.ndarray:
-    """The prior with its NaN pixels interpolated."""
-    gaps = ~np.isfinite(prior)
-    return solve_poisson(gaps, ~gaps, prior).values
 
 
 def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
