@@ -27,7 +27,7 @@ from .patchmatch import (
     refined,
     upsampled,
 )
-from .poisson import solve_hole
+from .poisson import solve_poisson
 from .regularity import continue_regularly, find_motions
 from .shift_map import shift_map
 from .surface import TangentPlanes, coarser, supports, warps, whole_patches
@@ -295,7 +295,7 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
             slope[across] += COPIED * (copied - slope[across])
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
-    return solve_hole(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values
+    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture, only_hole=True).values
 
 
 def _copied_steps(

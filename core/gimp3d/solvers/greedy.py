@@ -184,6 +184,5 @@ def _fill_inwards(
                 for i in range(size):
                     for j in range(size):
                         share[a + i, b + j] += max(best_share, LEAST_SHARE) / (size * size)
-        for a in range(max(0, y - radius - stamp), min(h, y + radius + stamp + 1)):
-            for b in range(max(0, x - radius - stamp), min(w, x + radius + stamp + 1)):
-                edges[a, b] = float32(-1)
+        around = radius + stamp
+        edges[max(0, y - around) : y + around + 1, max(0, x - around) : x + around + 1] = float32(-1)

@@ -15,7 +15,7 @@ import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ...compute.jit import exact_kernel, kernel
+from ...compute.jit import kernel
 from .multigrid import Multigrid, places_of
 
 HOLE, KNOWN = 1, 16  # kinds of pixels: a sum over the four neighbours counts both
@@ -50,6 +50,7 @@ def solve_poisson(
     *,
     weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor` (or to 0)
     anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
+    only_hole: bool = False,  # for large images with small holes: nothing else is made and returned
 ) -> PoissonSolution:
     """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
 
@@ -63,24 +64,6 @@ def solve_poisson(
     the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
     """
     hole = np.asarray(hole, bool)
-    solution = solve_hole(hole, known, values, guidance, settings, weight=weight, anchor=anchor)
-    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
-    filled[hole], unanchored[hole] = solution.values, solution.unanchored
-    return PoissonSolution(filled, solution.iterations, unanchored)
-
-
-def solve_hole(
-    hole: np.ndarray,
-    known: np.ndarray,
-    values: np.ndarray,
-    guidance: np.ndarray | None = None,
-    settings: PoissonSettings = PoissonSettings(),
-    *,
-    weight: np.ndarray | None = None,
-    anchor: np.ndarray | None = None,
-) -> PoissonSolution:
-    """As `solve_poisson`, for large images with small holes: only the hole's pixels are made and returned."""
-    hole = np.asarray(hole, bool)
     window = _window(hole)
 
     def cut(array: np.ndarray | None) -> Any:
@@ -89,7 +72,12 @@ def solve_hole(
     soft = None if weight is None else np.asarray(weight)[window]
     task = _Task(hole[window], np.asarray(known, bool)[window], cut(values), cut(guidance), soft, cut(anchor))
     solution = _solve(task, settings)
-    return replace(solution, values=solution.values.reshape(-1, *np.shape(values)[2:]))
+    inside = solution.values.reshape(-1, *np.shape(values)[2:])
+    if only_hole:
+        return replace(solution, values=inside)
+    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
+    filled[hole], unanchored[hole] = inside, solution.unanchored
+    return PoissonSolution(filled, solution.iterations, unanchored)
 
 
 def _window(hole: np.ndarray) -> tuple[Any, ...]:
@@ -136,9 +124,11 @@ def _solve(task: _Task, settings: PoissonSettings) -> PoissonSolution:
     # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for. `result` begins
     # as the guidance, and a rim pixel is tied to (known − guidance): see _known_ties.
     absent = None
-    if task.guidance is not None and not _take(task.guidance.reshape(h, -1), runs, channels, result.reshape(-1)):
-        absent = ~np.isfinite(result)
-        result[absent] = 0
+    if task.guidance is not None:
+        result[:] = task.guidance[task.hole]
+        if not np.isfinite(result).all():
+            absent = ~np.isfinite(result)
+            result[absent] = 0
     found = [_known_ties(task, rim, result, absent)]
     if task.weight is not None:
         found.append(_soft_ties(task, task.weight, result))
@@ -316,19 +306,6 @@ def _root(parent, r):
         parent[r] = parent[parent[r]]
         r = parent[r]
     return r
-
-
-@exact_kernel
-def _take(rows, runs, channels, out):
-    """out [M · channels] ← the unknowns' values in rows [h, w · channels]; whether all are finite."""
-    finite = True
-    for r in range(len(runs)):
-        row = rows[runs[r, 0] - 1, (runs[r, 1] - 1) * channels : (runs[r, 2] - 1) * channels]
-        to = out[runs[r, 3] * channels :]
-        for k in range(len(row)):
-            to[k] = row[k]
-            finite &= np.isfinite(row[k])
-    return finite
 
 
 @kernel

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import scipy.ndimage
 
@@ -178,18 +177,17 @@ def _completed_part(
     alone: Measured, guided: Measured | None, fit: PriorFit, settings: DepthSettings, first: bool
 ) -> _Part:
     """What is round one part continued into it, with the prior as far as that is believed."""
-    if guided is None:
-        around, believed, notes = alone, 0.0, []
-        plan = choose_plan(alone, settings, insist=first)
-        missed, filled = hold_out_miss(alone, plan, settings, alone.rim), fill(alone, plan, settings)
-    else:
+    around = alone
+    if guided is not None:
         around = guided if guided.touching.any() else replace(alone, guide=guided.guide)
-        plan = choose_plan(around, settings)
-        missed = hold_out_miss(around, plan, settings, around.rim)
-        filled, believed = _as_far_as_believed(fill(around, plan, settings), missed, fit, around, alone, settings)
-        notes = [f"prior believed by {believed:.0%}"] if believed <= 0.95 else []
-    notes = [*notes, plan.reason] if first else []
-    share, pixels = 1.0, int(around.hole.sum())
+    plan = choose_plan(around, settings, insist=first)
+    missed, filled = hold_out_miss(around, plan, settings, around.rim), fill(around, plan, settings)
+    believed, share, pixels = 0.0, 1.0, int(around.hole.sum())
+    notes = [plan.reason] if first else []
+    if guided is not None:
+        filled, believed = _as_far_as_believed(filled, missed, fit, around, alone, settings)
+        if first and believed <= 0.95:
+            notes.insert(0, f"prior believed by {believed:.0%}")
     undecided = around.hole & ~np.isfinite(filled)
     if undecided.any() and around.guide is not None:
         filled, share = np.where(undecided, around.guide + fit.shift, filled), 0.5
@@ -203,7 +201,10 @@ def _completed_part(
         share *= 0.5
         notes.append(f"{clamped} pixels clamped to the ring's range")
     sure = max(fit.confidence, believed)
-    return _Part(filled, share * sure * _trust(around, missed), pixels, min(share, sure), believed, clamped, notes)
+    # From the miss on a hold-out band and the distance to what is measured
+    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + distance_to(around.measured) / HOLD_OUT)
+    trust = share * sure * (1 / (1 + expected / EXPECTED))
+    return _Part(filled, trust, pixels, min(share, sure), believed, clamped, notes)
 
 
 def _clamped(filled: np.ndarray, around: Measured) -> tuple[np.ndarray, int]:
@@ -253,15 +254,7 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     return [*large, rest] if rest.any() else large
 
 
-def _trust(around: Measured, missed: float) -> np.ndarray:
-    """[H, W]: each pixel's confidence, from the miss on a hold-out band and the distance to what is measured."""
-    far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
-    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / HOLD_OUT)
-    return 1 / (1 + expected / EXPECTED)
-
-
 def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int) -> DepthCompletion:
-    disparity = disparity.astype(np.float32)
+    disparity, trust = disparity.astype(np.float32), trust.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
-    trust = trust.astype(np.float32)
     return DepthCompletion(disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, fit.confidence, fit.reason)

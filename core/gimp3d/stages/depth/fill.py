@@ -83,7 +83,7 @@ class Plan:
     reason: str
 
 
-def choose_plan(around: Measured, settings: DepthSettings, insist: bool = True) -> Plan:
+def choose_plan(around: Measured, settings: DepthSettings, insist: bool) -> Plan:
     """Planes, a thin plate or a membrane, as the settings say; "auto" takes what misses a hold-out band by less.
 
     Raises IllPosed if the settings and `insist` insist on planes and there are none.
