@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -129,7 +130,11 @@ def refined(
     tree, looks = NO_TREE, np.empty(0, np.float32)
     if index is not None:
         tree, looks = index.tree, coordinates(patches, index.components, patches.starts(*wanted)).ravel()
-    bands = row_bands(target)
+    # Bands hold about as many target pixels each; they depend on nothing else.
+    per_row = np.cumsum(target.sum(1))
+    count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))
+    limits = np.searchsorted(per_row, per_row[-1] * np.arange(1, count) / count) + 1
+    edges = np.unique(np.concatenate([[0], limits, [h]])).tolist()
     for sweep in range(settings.sweeps):
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
@@ -138,7 +143,7 @@ def refined(
             *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
-        parallel_map(partial(_sweep_band, *arguments), bands)
+        parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
     return NearestNeighbourField(rows, cols, cost, patches.radius)
 
 
@@ -164,15 +169,6 @@ def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     places[labels[allowed]] = np.flatnonzero(allowed)
     nearest = places[labels]
     return nearest // allowed.shape[1], nearest % allowed.shape[1]
-
-
-def row_bands(target: np.ndarray) -> list[tuple[int, int]]:
-    """Ranges of rows that hold about as many target pixels each; they depend on nothing else."""
-    per_row = np.cumsum(target.sum(1))
-    count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))
-    limits = np.searchsorted(per_row, per_row[-1] * np.arange(1, count) / count) + 1
-    edges = np.unique(np.concatenate([[0], limits, [len(per_row)]]))
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist()))
 
 
 @inline_kernel

@@ -112,8 +112,7 @@ def _fitted(disparity: np.ndarray, valid: np.ndarray) -> np.ndarray:
     weight = valid.astype(np.float64)
 
     def total(a: np.ndarray) -> np.ndarray:
-        side = 2 * WINDOW + 1
-        return cv2.boxFilter(a, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return cv2.boxFilter(a, -1, (2 * WINDOW + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
 
     count, sx, sy = total(weight), total(weight * x), total(weight * y)
     d, dx, dy = total(disparity), total(disparity * x), total(disparity * y)

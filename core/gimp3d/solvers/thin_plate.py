@@ -38,7 +38,11 @@ def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unkno
     window = bounds(domain)
     domain, weight = domain[window], weight[window]
     # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
-    trend = _slope(values[window], weight)
+    rows, cols = np.nonzero(weight > 0)
+    root, points = np.sqrt(weight[rows, cols]), np.stack([rows, cols, np.ones(len(rows))], -1)
+    slope = np.linalg.lstsq(points * root[:, None], values[window][rows, cols] * root, rcond=None)[0]
+    y, x = np.indices(domain.shape)
+    trend = slope[0] * y + slope[1] * x + slope[2]
     stride = int(np.ceil(np.sqrt(domain.sum() / unknowns)))
     count = _cells(weight, stride)
     mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
@@ -62,16 +66,6 @@ def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unkno
     inside = domain & cells.repeat(stride, 0).repeat(stride, 1)[:h, :w]
     result[window] = np.where(inside, _refined(coarse, cells, stride)[:h, :w] + trend, np.nan)
     return result
-
-
-def _slope(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The plane [H, W] through the values, by least squares."""
-    rows, cols = np.nonzero(weight > 0)
-    share = np.sqrt(weight[rows, cols])
-    points = np.stack([rows, cols, np.ones(len(rows))], -1)
-    plane = np.linalg.lstsq(points * share[:, None], values[rows, cols] * share, rcond=None)[0]
-    y, x = np.indices(values.shape)
-    return plane[0] * y + plane[1] * x + plane[2]
 
 
 def _cells(values: np.ndarray, stride: int) -> np.ndarray:

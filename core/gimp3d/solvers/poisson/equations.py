@@ -169,9 +169,8 @@ def _known_ties(task: _Task, rim: np.ndarray, start: np.ndarray, absent: np.ndar
     """The hole's pixels to their known neighbours, where those are finite."""
     unknowns, rows, columns = rim.T
     known = task.values[rows - 1, columns - 1].astype(np.float64)
-    if not np.isfinite(known).all():
-        sound = np.isfinite(known).all(1)
-        unknowns, rows, columns, known = (a[sound] for a in (unknowns, rows, columns, known))
+    sound = np.isfinite(known).all(1)
+    unknowns, rows, columns, known = (a[sound] for a in (unknowns, rows, columns, known))
     amounts = known - start[unknowns]
     if task.guidance is not None:
         beyond = task.guidance[rows - 1, columns - 1]

@@ -55,11 +55,7 @@ def complete_depth(
 
     Evidence clearly behind the surface that the surroundings tell is seen from under it, and dropped. Round the hole,
     pixels whose depth falls through a surface that other views agree on are not trusted: scans have leaks.
-
-    Raises
-    ------
-    IllPosed
-        As `complete_disparity`.
+    Raises IllPosed as `complete_disparity` does.
     """
     known = without_front(disparity, known, view.target, view.occluder, settings.layer_step)
     ring = known & (distance_to(view.target) <= RING)
@@ -114,11 +110,8 @@ def complete_disparity(
     in telling planes and layers. Known pixels that are NaN, infinite or negative are not known. A part of the hole
     that has no rim takes the prior, aligned to the ring, or the nearest depth.
 
-    Raises
-    ------
-    IllPosed
-        If the hole has no known rim at all and no prior that fits what is known; or if planes were insisted
-        on and there are none.
+    Raises IllPosed if the hole has no known rim at all and no prior that fits what is known; or if planes were insisted
+    on and there are none.
     """
     with np.errstate(invalid="ignore"):
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
@@ -196,7 +189,13 @@ def _completed_part(
         nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
         filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
         notes.append("a part of the hole has no rim: nearest depth used")
-    filled, clamped = _clamped(filled, around)
+    ring = around.measured & (around.distance <= BAND)
+    beside = around.disparity[ring if ring.any() else around.measured]
+    finite = beside[beside > 0]
+    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
+    if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
+        filled, low = np.where(filled < low, 0.0, filled), 0.0
+    clamped = int((around.hole & ((filled < low) | (filled > high))).sum())
     if clamped > LARGE * pixels:
         share *= 0.5
         notes.append(f"{clamped} pixels clamped to the ring's range")
@@ -204,19 +203,7 @@ def _completed_part(
     # From the miss on a hold-out band and the distance to what is measured
     expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + distance_to(around.measured) / HOLD_OUT)
     trust = share * sure * (1 / (1 + expected / EXPECTED))
-    return _Part(filled, trust, pixels, min(share, sure), believed, clamped, notes)
-
-
-def _clamped(filled: np.ndarray, around: Measured) -> tuple[np.ndarray, int]:
-    """The disparities kept to the ring's range, and how many of the hole's were not in it."""
-    ring = around.measured & (around.distance <= BAND)
-    beside = around.disparity[ring if ring.any() else around.measured]
-    finite = beside[beside > 0]
-    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
-    if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
-        filled = np.where(filled < low, 0.0, filled)
-        low = 0.0
-    return np.clip(filled, low, high), int((around.hole & ((filled < low) | (filled > high))).sum())
+    return _Part(np.clip(filled, low, high), trust, pixels, min(share, sure), believed, clamped, notes)
 
 
 def _as_far_as_believed(
