@@ -55,9 +55,8 @@ def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unkno
     for smoothing in (STIFF, SMOOTHING):
         energy = _energy(cells, smoothing**4 / stride**2, pull)
         system = (energy + scipy.sparse.diags(weights[cells])).tocsc()
-        factors = scipy.sparse.linalg.splu(
-            system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+        factors = scipy.sparse.linalg.splu(system, permc_spec="MMD_AT_PLUS_A", options=options)
         coarse[cells] = factors.solve(weights[cells] * mean[cells])
         # Tukey's weights of the residuals; never 0, lest a part of the domain lose all.
         off = np.where(count > 0, np.abs(coarse - mean), 0.0)

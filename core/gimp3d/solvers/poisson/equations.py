@@ -15,7 +15,7 @@ import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ...compute.jit import kernel
+from ...compute.jit import exact_kernel, kernel
 from .multigrid import Multigrid, places_of
 
 HOLE, KNOWN = 1, 16  # kinds of pixels: a sum over the four neighbours counts both
@@ -124,11 +124,9 @@ def _solve(task: _Task, settings: PoissonSettings) -> PoissonSolution:
     # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for. `result` begins
     # as the guidance, and a rim pixel is tied to (known − guidance): see _known_ties.
     absent = None
-    if task.guidance is not None:
-        result[:] = task.guidance[task.hole]
-        if not np.isfinite(result).all():
-            absent = ~np.isfinite(result)
-            result[absent] = 0
+    if task.guidance is not None and not _take(task.guidance.reshape(h, -1), runs, channels, result.reshape(-1)):
+        absent = ~np.isfinite(result)
+        result[absent] = 0
     found = [_known_ties(task, rim, result, absent)]
     if task.weight is not None:
         found.append(_soft_ties(task, task.weight, result))
@@ -233,9 +231,8 @@ def _factorise(kind: np.ndarray, inverse: np.ndarray) -> Any:
         neighbour = index[rows + dy, columns + dx]
         linked = np.flatnonzero(neighbour >= 0)
         matrix -= scipy.sparse.csc_matrix((np.ones(len(linked)), (linked, neighbour[linked])), matrix.shape)
-    factor = scipy.sparse.linalg.splu(
-        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0}
-    )
+    options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+    factor = scipy.sparse.linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", options=options)
 
     def solve(at: np.ndarray, amounts: np.ndarray) -> np.ndarray:
         right, u = np.bincount(at, amounts, inverse.size), np.zeros(inverse.size)
@@ -305,6 +302,19 @@ def _root(parent, r):
         parent[r] = parent[parent[r]]
         r = parent[r]
     return r
+
+
+@exact_kernel
+def _take(rows, runs, channels, out):
+    """out [M · channels] ← the unknowns' values in rows [h, w · channels]; whether all are finite."""
+    finite = True
+    for r in range(len(runs)):
+        row = rows[runs[r, 0] - 1, (runs[r, 1] - 1) * channels : (runs[r, 2] - 1) * channels]
+        to = out[runs[r, 3] * channels :]
+        for k in range(len(row)):
+            to[k] = row[k]
+            finite &= np.isfinite(row[k])
+    return finite
 
 
 @kernel

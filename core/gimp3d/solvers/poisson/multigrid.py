@@ -42,12 +42,8 @@ GAP = 8  # spans go on over gaps of so many places
 DAMPING = 0.9  # of the Jacobi step, against one that could just diverge
 INSIDE, PLAIN = 1, 2  # flags of pixels and nodes: an unknown; its stencil is that of the inner hole
 # PᵀAP in one dimension: what the link d − 1 of the finer node a − 1 gives to the link J − 1 of the node in the middle
-SHARES = np.array(
-    [
-        [[(1 - abs(a) / 2) * max(0, 1 - abs(a + d - 2 * J) / 2) for J in (-1, 0, 1)] for d in (-1, 0, 1)]
-        for a in (-1, 0, 1)
-    ]
-)
+NEAR = (-1, 0, 1)
+SHARES = np.array([[[(1 - abs(a) / 2) * max(0, 1 - abs(a + d - 2 * J) / 2) for J in NEAR] for d in NEAR] for a in NEAR])
 DESCEND, DESCEND_AGAIN, ASCEND, SOLVE = range(4)  # tasks of a cycle
 ONE, TWO = np.uint64(1), np.uint64(2)  # places are unsigned: numba would wrap signed ones, and not vectorise
 
@@ -364,17 +360,10 @@ def _turn(fine, work, beta):
 @inline_kernel
 def _times(stencils, u, k, n):
     """A·u at node k."""
-    return (
-        stencils[0, k] * u[k]
-        + stencils[1, k] * u[k + ONE]
-        + stencils[1, k - ONE] * u[k - ONE]
-        + stencils[2, k] * u[k + n - ONE]
-        + stencils[2, k - n + ONE] * u[k - n + ONE]
-        + stencils[3, k] * u[k + n]
-        + stencils[3, k - n] * u[k - n]
-        + stencils[4, k] * u[k + n + ONE]
-        + stencils[4, k - n - ONE] * u[k - n - ONE]
-    )
+    total = stencils[0, k] * u[k] + stencils[1, k] * u[k + ONE] + stencils[1, k - ONE] * u[k - ONE]
+    total = total + stencils[2, k] * u[k + n - ONE] + stencils[2, k - n + ONE] * u[k - n + ONE]
+    total = total + stencils[3, k] * u[k + n] + stencils[3, k - n] * u[k - n]
+    return total + stencils[4, k] * u[k + n + ONE] + stencils[4, k - n - ONE] * u[k - n - ONE]
 
 
 @kernel
