@@ -27,7 +27,7 @@ from .patchmatch import (
     refined,
     upsampled,
 )
-from .poisson import solve_hole
+from .poisson import solve_poisson
 from .regularity import continue_regularly, find_motions
 from .shift_map import shift_map
 from .surface import TangentPlanes, coarser, supports, warps, whole_patches
@@ -198,7 +198,7 @@ def _filled(
     """
     hole, allowed, radius = level.hole, level.allowed, level.radius
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
-    guides, repaint, index = level.channels[..., 3:].copy(), repainting(hole, radius), None
+    guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
     matching, reach = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps), REACH
     if coarser is None:
         rows, cols = fill_inwards(
@@ -222,7 +222,7 @@ def _filled(
     def matched(
         field: NearestNeighbourField, colours: np.ndarray, number: int
     ) -> tuple[NearestNeighbourField, np.ndarray]:
-        repaint(patches, colours[:, :3])
+        repaint(colours[:, :3])
         guides[hole] = colours[:, 3:]
         field = refined(
             field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,
@@ -295,7 +295,7 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
             slope[across] += COPIED * (copied - slope[across])
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
-    return solve_hole(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values
+    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture, only_hole=True).values
 
 
 def _copied_steps(

@@ -12,7 +12,6 @@ from .patches import lay_out
 from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, TangentPlanes, supports
 
 MOST_SOURCES = 4096  # patches that are tried for each place
-NO_SUPPORT = np.empty((0, 0), np.uint8)
 LEAST_SHARE = 1e-6  # what was copied without anything known around
 FIRST = float32(10)  # times as urgent as others are places on lines
 PLAIN = 0.03  # slope of colour per pixel, where no edge runs into the hole, by which a place counts nevertheless
@@ -24,8 +23,8 @@ def fill_inwards(
     allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
     radius: int,
     first: np.ndarray,  # [H, W] float32 in [0, 1]: how near a place is to a line that is filled before the rest
-    surface: TangentPlanes | None = None,  # copy along its tangent planes
-    usable: np.ndarray | None = None,  # [H, W] bool, what may be copied then
+    surface: TangentPlanes | None,  # copy along its tangent planes
+    usable: np.ndarray,  # [H, W] bool, what may be copied then
 ) -> tuple[np.ndarray, np.ndarray]:
     """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.
 
@@ -41,23 +40,19 @@ def fill_inwards(
     found_rows, found_cols = np.full((2, *hole.shape), -1, np.int32)
     share = cv2.blur(known, (2 * radius + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
     places = np.argwhere(hole)
-    number, support = np.full(hole.shape, -1), NO_SUPPORT
-    if surface is not None:
-        number[hole] = np.arange(len(places))
-        support = supports(surface, places, radius)
+    number = np.full(hole.shape, -1)
+    number[hole] = np.arange(len(places))
     _fill_inwards(
-        *patches, first, places, rows[thinned], cols[thinned], ~hole if usable is None else usable, known, share,
-        surface is not None, *(surface or NO_SURFACE), support, number, found_rows, found_cols,
+        *patches, first, places, rows[thinned], cols[thinned], usable, known, share, surface is not None,
+        *(surface or NO_SURFACE), supports(surface, places, radius), number, found_rows, found_cols,
     )  # fmt: skip
     return found_rows, found_cols
 
 
 @inline_kernel
 def _edge_into_hole(values, stride, channels, radius, known, y, x):
-    """How steep the strongest edge near a place of the rim is, times how straight it runs into the hole.
-
-    In the layout, where the patch at (y, x) begins, as `known` does.
-    """
+    """How steep the strongest edge near a place of the rim is, times how straight it runs into the hole. The patch
+    begins at (y, x) in the layout and in `known`."""
     size = 2 * radius + 1
     steepest, along_x, along_y, inward_x, inward_y = float32(0), float32(0), float32(0), float32(0), float32(0)
     for i in range(size):
@@ -189,6 +184,5 @@ def _fill_inwards(
                 for i in range(size):
                     for j in range(size):
                         share[a + i, b + j] += max(best_share, LEAST_SHARE) / (size * size)
-        for a in range(max(0, y - radius - stamp), min(h, y + radius + stamp + 1)):
-            for b in range(max(0, x - radius - stamp), min(w, x + radius + stamp + 1)):
-                edges[a, b] = float32(-1)
+        around = radius + stamp
+        edges[max(0, y - around) : y + around + 1, max(0, x - around) : x + around + 1] = float32(-1)

@@ -1,15 +1,12 @@
 """A kd-tree over a picture's patches whose leaves are blocks of 16, so that a leaf is compared at once.
 
-Our own, as scipy's cKDTree was measured to take longer: it answers for one patch at a time, where sweeps also look into
-the leaves of their neighbours' sources (He & Sun 2012). With cKDTree's guesses in place of the tree, the fields of two
-photographs of 1080p were as near to the exact ones after 1.8–2 times the CPU time (0.73 -> 1.3–1.4 s, one thread). The
-charts of five removals (160–480 px) cost 2–6 % more after as many sweeps; to cost as little they took twice as many,
-and 1.3–2.4 times the time (16–68 -> 23–164 ms).
+Our own, as scipy's cKDTree answers for one patch at a time, where sweeps also look into the leaves of their neighbours'
+sources (He & Sun 2012). With its guesses in place of the tree, fields as near to the exact ones took 1.8–2 times the
+CPU time on two photographs of 1080p (0.73 -> 1.3–1.4 s, one thread), 1.3–2.4 times on five charts (16–68 -> 23–164 ms).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -44,20 +41,15 @@ _floats, _integers = np.empty(0, np.float32), np.empty(0, np.int32)
 NO_TREE = Tree(_floats, _integers, _integers, _integers, _floats, np.empty((0, 0), np.int32), 1)
 
 
-@dataclass(frozen=True)
-class PatchIndex:
+class PatchIndex(NamedTuple):
     """A tree and the coordinates it is built on. Patches of any picture of the same radius can be looked up."""
 
     components: Components
     tree: Tree
 
 
-def index_patches(
-    patches: Patches,
-    allowed: np.ndarray,  # [H, W] bool, centres, at least one
-    step: int,
-) -> PatchIndex:
-    """Index the allowed patches on a grid of every `step`-th row and column, or all if none lies on it."""
+def index_patches(patches: Patches, allowed: np.ndarray, step: int) -> PatchIndex:
+    """Index the patches `allowed` ([H, W] bool, centres) on a grid of every `step`-th row and column, or else all."""
     if not allowed[::step, ::step].any():
         step = 1
     rows, cols = (a * step for a in np.nonzero(allowed[::step, ::step]))
@@ -67,8 +59,7 @@ def index_patches(
     count = -(-len(rows) // LANES)
     order = np.arange(len(rows), dtype=np.int32)
     split_component, split_value = np.zeros(count, np.int32), np.zeros(count, np.float32)
-    growing = found, order, split_component, split_value
-    nodes = [(0, count)]
+    growing, nodes = (found, order, split_component, split_value), [(0, count)]
     while len(nodes) < min(SUBTREES, count):  # nodes of one depth differ in size by one block at most
         parallel_map(lambda node: _split(*node, *growing), nodes)
         nodes = [half for lo, hi in nodes for half in ((lo, (lo + hi) // 2), ((lo + hi) // 2, hi)) if half[1] > half[0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -30,11 +31,8 @@ class Patches(NamedTuple):
         return rows.astype(np.int64) * self.stride + cols * self.channels
 
 
-def lay_out(
-    channels: np.ndarray,  # [H, W, C] float32, finite
-    radius: int,
-) -> Patches:
-    """The picture's patches of side 2·radius + 1; patches at the border see it mirrored."""
+def lay_out(channels: np.ndarray, radius: int) -> Patches:
+    """Patches of side 2·radius + 1 of `channels` [H, W, C] float32, finite; at the border they see it mirrored."""
     count, size = channels.shape[2], 2 * radius + 1
     weights = np.zeros(-(-size * count // LANES) * LANES, np.float32)
     weights[: size * count] = 1 / (size * size * count)
@@ -44,28 +42,21 @@ def lay_out(
     return Patches(values, bordered.shape[1] * count, count, radius, weights)
 
 
-class Repaint(NamedTuple):
-    """Where in laid-out patches the pixels lie that change; at the border they lie there more than once."""
+def repainting(patches: Patches, changing: np.ndarray) -> Callable[[np.ndarray], None]:
+    """What puts new colours [N, C] of the pixels `changing` ([H, W] bool), in the order of np.nonzero, into `values`.
 
-    places: np.ndarray  # [M] pixels of the layout
-    numbers: np.ndarray  # [M] which of the changing pixels this is
-
-    def __call__(self, patches: Patches, colours: np.ndarray) -> None:
-        """Put new colours [N, C] of the changing pixels, in the order of np.nonzero, into `values`."""
-        pixels = patches.values[: len(patches.values) - len(patches.weights)].reshape(-1, patches.channels)
-        pixels[self.places] = colours[self.numbers]
-
-
-def repainting(
-    changing: np.ndarray,  # [H, W] bool
-    radius: int,
-) -> Repaint:
-    """How to change these pixels in place: laying a large picture out anew for a small hole is slow."""
-    numbers = np.full(changing.shape, -1, np.int32)
+    Laying a large picture out anew for a small hole is slow.
+    """
+    numbers, r = np.full(changing.shape, -1, np.int32), patches.radius
     numbers[changing] = np.arange(changing.sum())
-    bordered = cv2.copyMakeBorder(numbers, radius, radius, radius, radius, cv2.BORDER_REFLECT_101).ravel()
-    places = np.flatnonzero(bordered >= 0)
-    return Repaint(places, bordered[places])
+    bordered = cv2.copyMakeBorder(numbers, r, r, r, r, cv2.BORDER_REFLECT_101).ravel()
+    places = np.flatnonzero(bordered >= 0)  # at the border, a pixel lies there more than once
+    pixels, numbers = patches.values[: bordered.size * patches.channels].reshape(bordered.size, -1), bordered[places]
+
+    def repaint(colours: np.ndarray) -> None:
+        pixels[places] = colours[numbers]
+
+    return repaint
 
 
 class Components(NamedTuple):
@@ -88,12 +79,8 @@ def main_components(patches: Patches, starts: np.ndarray) -> Components:
     return Components(mean.astype(np.float32), basis)
 
 
-def coordinates(
-    patches: Patches,
-    components: Components,
-    starts: np.ndarray,  # [N] int64
-) -> np.ndarray:
-    """[N, 16] float32 of the patches that begin at `starts`."""
+def coordinates(patches: Patches, components: Components, starts: np.ndarray) -> np.ndarray:
+    """[N, 16] float32 of the patches that begin at `starts` [N] int64."""
     out = np.empty((len(starts), LANES), np.float32)
     size = 2 * patches.radius + 1
     parts = components.mean, components.basis.ravel(), starts, out.ravel()

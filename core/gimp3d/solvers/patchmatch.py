@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -31,7 +31,6 @@ TRUNCATION = 8.0  # px; offsets that differ by more are incoherent: coherence is
 GRID = 2  # px between the sources that the tree holds; sweeps look at those between
 TREE_SWEEPS = 2  # the first ones, which look into the neighbours' leaves of the tree
 REACH = 4  # px, of the random search round the best source
-NO_LOOKS, NO_SUPPORT = np.empty(0, np.float32), np.empty((0, 0), np.uint8)
 IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
 SAME = np.float32(255.0**-2 / 4)  # half a grey level: the tree is not asked for better, or plain areas lose coherence
 TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only decides between equal patches
@@ -77,29 +76,22 @@ def nearest_neighbour_field(
     pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
     """
     radius = settings.patch // 2
-    while radius > 0 and not (source & patch_centres(~target, radius)).any():
+    while not (allowed := source & patch_centres(~target, radius)).any() and radius > 0:
         radius -= 1
-    extra = np.zeros(target.shape, np.float32) if penalty is None else penalty.astype(np.float32)
-    allowed = source & patch_centres(~target, radius)
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
-    return refined(None, patches, target, allowed, settings, extra, index)
+    return refined(None, patches, target, allowed, settings, penalty, index)
 
 
-def patch_centres(
-    usable: np.ndarray,  # [H, W] bool
-    radius: int,
-) -> np.ndarray:
-    """[H, W] bool: centres of the patches that lie wholly in the image and on usable pixels."""
+def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
+    """[H, W] bool: centres of the patches that lie wholly in the image and on `usable` pixels ([H, W] bool)."""
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return cv2.erode(usable.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def upsampled(
-    field: NearestNeighbourField,
-    target: np.ndarray,  # [H, W] bool at the finer level
-) -> NearestNeighbourField:
-    """The field at twice the resolution: f ← 2·f plus the pixel's parity; its cost is not known yet."""
+def upsampled(field: NearestNeighbourField, target: np.ndarray) -> NearestNeighbourField:
+    """The field at twice the resolution, that of `target`: f ← 2·f plus the pixel's parity; its cost is not known
+    yet."""
     h, w = target.shape
     y, x = np.nonzero(target & (field.rows.repeat(2, 0).repeat(2, 1)[:h, :w] >= 0))
     rows, cols = np.full((2, h, w), -1, np.int32)
@@ -120,7 +112,7 @@ def refined(
     surface: TangentPlanes | None = None,  # compare patches on its tangent planes
     usable: np.ndarray | None = None,  # [H, W] bool, pixels that slanted patches may be copied from; None: not target
     reach: int = REACH,  # px, of the random search
-    tree_sweeps: int | None = None,  # None: TREE_SWEEPS
+    tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
@@ -129,19 +121,20 @@ def refined(
     if not allowed.any() or not target.any():
         return NearestNeighbourField(rows, cols, cost, patches.radius)
     start = _first_guess(field, target, allowed)
-    extra = np.zeros((h, w), np.float32) if penalty is None else penalty
+    extra = np.zeros((h, w), np.float32) if penalty is None else penalty.astype(np.float32)
     guides = np.empty((h, w, 0), np.float32) if guides is None else guides
     weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
-    looks, number, support = NO_LOOKS, np.zeros((h, w), np.int32), NO_SUPPORT
-    wanted = np.nonzero(target)
+    number, wanted = np.zeros((h, w), np.int32), np.nonzero(target)
     number[wanted] = np.arange(len(wanted[0]))
-    if surface is not None:
-        support = supports(surface, np.stack(wanted, 1), patches.radius)
+    support = supports(surface, np.stack(wanted, 1), patches.radius)
+    tree, looks = NO_TREE, np.empty(0, np.float32)
     if index is not None:
-        looks = coordinates(patches, index.components, patches.starts(*wanted)).ravel()
-    tree = NO_TREE if index is None else index.tree
-    bands = row_bands(target)
-    tree_sweeps = TREE_SWEEPS if tree_sweeps is None else tree_sweeps
+        tree, looks = index.tree, coordinates(patches, index.components, patches.starts(*wanted)).ravel()
+    # Bands hold about as many target pixels each; they depend on nothing else.
+    per_row = np.cumsum(target.sum(1))
+    count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))
+    limits = np.searchsorted(per_row, per_row[-1] * np.arange(1, count) / count) + 1
+    edges = np.unique(np.concatenate([[0], limits, [h]])).tolist()
     for sweep in range(settings.sweeps):
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
@@ -150,12 +143,8 @@ def refined(
             *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
-        parallel_map(partial(_run_band, arguments), bands)
+        parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
     return NearestNeighbourField(rows, cols, cost, patches.radius)
-
-
-def _run_band(arguments: tuple[Any, ...], band: tuple[int, int]) -> None:
-    _sweep_band(*band, *arguments)
 
 
 def _first_guess(
@@ -182,15 +171,6 @@ def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return nearest // allowed.shape[1], nearest % allowed.shape[1]
 
 
-def row_bands(target: np.ndarray) -> list[tuple[int, int]]:
-    """Ranges of rows that hold about as many target pixels each; they depend on nothing else."""
-    per_row = np.cumsum(target.sum(1))
-    count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))
-    limits = np.searchsorted(per_row, per_row[-1] * np.arange(1, count) / count) + 1
-    edges = np.unique(np.concatenate([[0], limits, [len(per_row)]]))
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist()))
-
-
 @inline_kernel
 def _hash(x):
     x ^= x >> uint32(16)
@@ -202,24 +182,22 @@ def _hash(x):
 
 @kernel
 def _sweep_band(
-    lo, hi, target, allowed, values, stride, channels, radius, row_weights, penalty,
+    target, allowed, values, stride, channels, radius, row_weights, penalty,
     weight, coherence, truncation, tie, guides,
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
     slanted, point, normal, frame, inverse, plane, clear, support, usable,
-    start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost,
+    start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost, band,
 ):  # fmt: skip
-    """One sweep over rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones near.
+    """One sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones
+    near.
 
     The first sweep begins with `start` and each patch's own leaf. Neighbours in this band are up to date, others
     are as the last sweep left them. A candidate's cost is found in one place, written out: a helper that takes
     arrays would count references for each.
     """
-    h, w = target.shape
-    size = 2 * radius + 1
-    step = 1 if downward else -1
-    salt = _hash(random)
-    bounds = np.empty(16, np.float32)
-    to_scan = np.empty(3, np.int64)
+    (lo, hi), (h, w) = band, target.shape
+    size, step, salt = 2 * radius + 1, 1 if downward else -1, _hash(random)
+    bounds, to_scan = np.empty(16, np.float32), np.empty(3, np.int64)
     for i in range(hi - lo):
         y = lo + i if downward else hi - 1 - i
         for j in range(w):

@@ -39,16 +39,14 @@ class PlanarSurfaces:
 
 
 def planar_surfaces(
-    disparity: np.ndarray,  # [H, W]; 0 = sky
-    known: np.ndarray,  # [H, W] bool
-    distance: np.ndarray,  # [H, W] px to the hole; 0 at pixels in the hole that are known all the same
-    inlier: float = INLIER,  # relative
+    disparity: np.ndarray, known: np.ndarray, distance: np.ndarray, inlier: float = INLIER
 ) -> PlanarSurfaces:
     """The planes on which the ring round the hole lies, largest first; sky is the plane d = 0.
 
-    Sequential RANSAC (Fischler & Bolles 1981) with a fixed seed, each plane refined by least squares. Only planes that
-    touch the hole count. Two that the ring shows to meet become one surface: the nearer one where they are concave (a
-    room seen from inside: max of disparities), the farther where convex (min). Two that do not, a step, stay two.
+    `distance` [H, W] are px to the hole; 0 at pixels in the hole that are `known` all the same. Sequential RANSAC
+    (Fischler & Bolles 1981) with a fixed seed, each plane refined by least squares. Only planes that touch the hole
+    count. Two that the ring shows to meet become one surface: the nearer one where they are concave (a room seen from
+    inside: max of disparities), the farther where convex (min). Two that do not, a step, stay two.
     """
     ring = known & (distance <= RING)
     rim = known & (distance < 2)

@@ -8,11 +8,8 @@ CUT = 4.685  # σ beyond which an equation counts for nothing: Tukey's biweight 
 ROUNDS = 20  # of reweighting
 
 
-def robust_fit(
-    rows: np.ndarray,  # [N, K] float64
-    target: np.ndarray,  # [N]
-) -> tuple[np.ndarray, float]:
-    """(x [K], σ) of rows · x ≈ target by iteratively reweighted least squares (Holland & Welsch 1977).
+def robust_fit(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
+    """(x [K], σ) of rows [N, K] · x ≈ target [N] by iteratively reweighted least squares (Holland & Welsch 1977).
 
     It starts from plain least squares: data that lie on two lines with errors are one cloud to it, where a start from
     the line nearest to most of them (least median of squares) takes the errors within one cloud for a slope. σ is the

@@ -46,11 +46,11 @@ _none = [np.empty((0, 0, n), np.float32) for n in (3, 3, 4, 4, 3)]
 NO_SURFACE = TangentPlanes(_none[0], _none[1], _none[2], _none[3], _none[4], np.empty((0, 0), bool))
 
 
-def tangent_planes(
-    disparity: np.ndarray,  # [H, W] 1/z, 0 = infinitely far or nothing
-    K: np.ndarray,  # [3, 3]
-) -> TangentPlanes:
-    """The plane round each pixel that fits best, from windows round it and beside it: edges do not tilt planes."""
+def tangent_planes(disparity: np.ndarray, K: np.ndarray) -> TangentPlanes:
+    """The plane round each pixel that fits best, from windows round it and beside it: edges do not tilt planes.
+
+    `disparity` [H, W] is 1/z, 0 = infinitely far or nothing.
+    """
     valid = np.isfinite(disparity) & (disparity > 0)
     known = np.where(valid, disparity, 0.0).astype(np.float64)
     far = SKY / max(float(known[valid].min(initial=1.0)), 1e-9)
@@ -85,14 +85,9 @@ def _planes(known: np.ndarray, valid: np.ndarray, K: np.ndarray, far: float) -> 
     point, normal, frame, inverse, plane = (
         np.ascontiguousarray(a, np.float32) for a in (rays * depth[..., None], normal, frame, inverse, plane)
     )
-    return TangentPlanes(point, normal, frame, inverse, plane, ~_beside_nearer(known, plane))
-
-
-def _beside_nearer(disparity: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """[H, W] bool: something close by is nearer than the pixel's own plane is there."""
-    side = 2 * MIXED + 1
-    nearest = cv2.dilate(disparity, np.ones((side, side), np.uint8))
-    return nearest > (1 + NEARER) * (disparity + MIXED * np.abs(plane[..., 1:]).sum(-1))
+    nearest = cv2.dilate(known, np.ones((2 * MIXED + 1, 2 * MIXED + 1), np.uint8))
+    beside_nearer = nearest > (1 + NEARER) * (known + MIXED * np.abs(plane[..., 1:]).sum(-1))
+    return TangentPlanes(point, normal, frame, inverse, plane, ~beside_nearer)
 
 
 def _projected(normal: np.ndarray, rays: np.ndarray, depth: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -117,8 +112,7 @@ def _fitted(disparity: np.ndarray, valid: np.ndarray) -> np.ndarray:
     weight = valid.astype(np.float64)
 
     def total(a: np.ndarray) -> np.ndarray:
-        side = 2 * WINDOW + 1
-        return cv2.boxFilter(a, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return cv2.boxFilter(a, -1, (2 * WINDOW + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
 
     count, sx, sy = total(weight), total(weight * x), total(weight * y)
     d, dx, dy = total(disparity), total(disparity * x), total(disparity * y)
@@ -169,8 +163,10 @@ def coarser(surface: TangentPlanes, level: int, shape: tuple[int, ...]) -> Tange
     return TangentPlanes(*arrays)
 
 
-def supports(surface: TangentPlanes, places: np.ndarray, radius: int) -> np.ndarray:
+def supports(surface: TangentPlanes | None, places: np.ndarray, radius: int) -> np.ndarray:
     """[N, (2 radius + 1)²] uint8: which pixels of the patches at `places` ([N, 2]) lie on the centre's surface."""
+    if surface is None:
+        return np.empty((0, 0), np.uint8)
     found = np.empty((len(places), (2 * radius + 1) ** 2), np.uint8)
     run_ranges(_support, len(places), places, surface.normal, surface.disparity, surface.clear, radius, found)
     return found

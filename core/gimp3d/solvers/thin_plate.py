@@ -22,16 +22,12 @@ STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one b
 OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
 
 
-def thin_plate(
-    values: np.ndarray,  # [H, W]
-    weight: np.ndarray,  # [H, W] ≥ 0, how much each value counts; 0 = unknown
-    wanted: np.ndarray,  # [H, W] bool, where the surface is asked for
-    unknowns: int = UNKNOWNS,  # at most
-) -> np.ndarray:
+def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unknowns: int = UNKNOWNS) -> np.ndarray:
     """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
 
-    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²) over wanted pixels and those of weight > 0,
-    s the values' common slope (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a
+    `weight` [H, W] ≥ 0 is how much each value counts, 0 = unknown; `wanted` [H, W] bool where it is asked for.
+    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²) over wanted pixels and those of weight > 0, s
+    the values' common slope (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a
     sparse factorisation. Parts of the domain without a value are NaN.
     """
     wanted, weight = np.asarray(wanted, bool), np.asarray(weight, np.float64)
@@ -42,7 +38,11 @@ def thin_plate(
     window = bounds(domain)
     domain, weight = domain[window], weight[window]
     # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
-    trend = _slope(values[window], weight)
+    rows, cols = np.nonzero(weight > 0)
+    root, points = np.sqrt(weight[rows, cols]), np.stack([rows, cols, np.ones(len(rows))], -1)
+    slope = np.linalg.lstsq(points * root[:, None], values[window][rows, cols] * root, rcond=None)[0]
+    y, x = np.indices(domain.shape)
+    trend = slope[0] * y + slope[1] * x + slope[2]
     stride = int(np.ceil(np.sqrt(domain.sum() / unknowns)))
     count = _cells(weight, stride)
     mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
@@ -51,24 +51,20 @@ def thin_plate(
     cells &= np.isin(parts, parts[count > 0])
     radius = max(np.sqrt(wanted.sum() / np.pi), 1.0)
     pull = (TENSION * radius / stride) ** -2
-    coarse = np.full(cells.shape, np.nan)
-    coarse[cells] = _minimum(_energy(cells, STIFF**4 / stride**2, pull), count[cells], mean[cells])
-    weights = count * _biweight(coarse - mean, count > 0)
-    coarse[cells] = _minimum(_energy(cells, SMOOTHING**4 / stride**2, pull), weights[cells], mean[cells])
-    fine = _refined(coarse, cells, stride)[: domain.shape[0], : domain.shape[1]]
-    inside = domain & np.repeat(np.repeat(cells, stride, 0), stride, 1)[: domain.shape[0], : domain.shape[1]]
-    result[window] = np.where(inside, fine + trend, np.nan)
+    coarse, weights, (h, w) = np.full(cells.shape, np.nan), count, domain.shape
+    for smoothing in (STIFF, SMOOTHING):
+        energy = _energy(cells, smoothing**4 / stride**2, pull)
+        system = (energy + scipy.sparse.diags(weights[cells])).tocsc()
+        options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+        factors = scipy.sparse.linalg.splu(system, permc_spec="MMD_AT_PLUS_A", options=options)
+        coarse[cells] = factors.solve(weights[cells] * mean[cells])
+        # Tukey's weights of the residuals; never 0, lest a part of the domain lose all.
+        off = np.where(count > 0, np.abs(coarse - mean), 0.0)
+        share = off / (OUTLIER * (1.4826 * float(np.median(off[count > 0]))) + 1e-300)
+        weights = count * np.maximum(1 - np.minimum(share, 1.0) ** 2, 1e-3) ** 2
+    inside = domain & cells.repeat(stride, 0).repeat(stride, 1)[:h, :w]
+    result[window] = np.where(inside, _refined(coarse, cells, stride)[:h, :w] + trend, np.nan)
     return result
-
-
-def _slope(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The plane [H, W] through the values, by least squares."""
-    rows, cols = np.nonzero(weight > 0)
-    share = np.sqrt(weight[rows, cols])
-    points = np.stack([rows, cols, np.ones(len(rows))], -1)
-    plane = np.linalg.lstsq(points * share[:, None], values[rows, cols] * share, rcond=None)[0]
-    y, x = np.indices(values.shape)
-    return plane[0] * y + plane[1] * x + plane[2]
 
 
 def _cells(values: np.ndarray, stride: int) -> np.ndarray:
@@ -103,32 +99,12 @@ def _energy(cells: np.ndarray, stiffness: float, tension: float) -> scipy.sparse
     return energy
 
 
-def _minimum(energy: scipy.sparse.csr_matrix, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
-    system = (energy + scipy.sparse.diags(weight)).tocsc()
-    factors = scipy.sparse.linalg.splu(
-        system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
-    return factors.solve(weight * values)
-
-
-def _biweight(residual: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Tukey's weights of the residuals ; never 0, lest a part of the domain lose all."""
-    scale = 1.4826 * float(np.median(np.abs(residual[there])))
-    share = np.where(there, np.abs(residual), 0.0) / (OUTLIER * scale + 1e-300)
-    return np.maximum(1 - np.minimum(share, 1.0) ** 2, 1e-3) ** 2
-
-
 def _refined(coarse: np.ndarray, cells: np.ndarray, stride: int) -> np.ndarray:
     """Bicubic, from cells to pixels."""
     if stride == 1:
         return coarse
     nearest = scipy.ndimage.distance_transform_edt(~cells, return_distances=False, return_indices=True)
-    h, w = coarse.shape
-    scale, shift = 1 / stride, 0.5 / stride - 0.5
-    return cv2.warpAffine(
-        coarse[tuple(nearest)],
-        np.array([[scale, 0, shift], [0, scale, shift]]),
-        (w * stride, h * stride),
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    size = coarse.shape[1] * stride, coarse.shape[0] * stride
+    to_cells = np.array([[1, 0, 0.5], [0, 1, 0.5]]) / stride - [[0, 0, 0.5], [0, 0, 0.5]]
+    flags, border = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    return cv2.warpAffine(coarse[tuple(nearest)], to_cells, size, flags=flags, borderMode=border)

@@ -9,10 +9,11 @@ import scipy.stats
 
 from gimp3d.errors import IllPosed
 from gimp3d.solvers.poisson import solve_poisson
-from gimp3d.stages.depth import DepthSettings, complete_disparity, fit_prior
+from gimp3d.stages.depth import DepthSettings, complete_disparity
 from gimp3d.stages.depth import complete as complete_module
 from gimp3d.stages.depth.evidence import DepthEvidence
 from gimp3d.stages.depth.layers import background_rim
+from gimp3d.stages.depth.prior import fit_prior
 
 H, W = 120, 160
 V, U = np.mgrid[:H, :W].astype(float)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gimp3d.stages.depth.layers import background_rim, divided, separated, steps, without_front
+from gimp3d.stages.depth.layers import STEP, background_rim, divided, separated, steps, without_front
 
 H, W = 120, 160
 V, U = np.mgrid[:H, :W].astype(float)
@@ -51,10 +51,10 @@ def test_the_layer_that_makes_up_much_of_the_rim_is_no_occluder():
 def test_what_hides_the_object_goes_however_large_it_is():
     scene = np.where(V > 65, 0.5, 0.1)
     front = RIM & (V > 65)
-    left = without_front(scene, ~HOLE, HOLE, front)
+    left = without_front(scene, ~HOLE, HOLE, front, STEP)
     ring = np.hypot(V - 60, U - 80) < 40
     assert not left[ring & (V > 66)].any() and left[ring & (V < 63) & ~HOLE].all()
-    assert without_front(scene, ~HOLE, HOLE, np.zeros_like(HOLE))[~HOLE].all()
+    assert without_front(scene, ~HOLE, HOLE, np.zeros_like(HOLE), STEP)[~HOLE].all()
 
 
 def test_steps_are_no_slopes():

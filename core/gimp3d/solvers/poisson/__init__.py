@@ -4,6 +4,6 @@
 `multigrid.py` solves it.
 """
 
-from .equations import HoleSolution, PoissonSettings, PoissonSolution, solve_hole, solve_poisson
+from .equations import PoissonSettings, PoissonSolution, solve_poisson
 
-__all__ = ["HoleSolution", "PoissonSettings", "PoissonSolution", "solve_hole", "solve_poisson"]
+__all__ = ["PoissonSettings", "PoissonSolution", "solve_poisson"]

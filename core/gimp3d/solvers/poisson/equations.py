@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.ndimage
 import scipy.sparse
 import scipy.sparse.linalg
 
@@ -33,20 +34,11 @@ class PoissonSettings:
 
 @dataclass(frozen=True)
 class PoissonSolution:
-    """A filled array."""
+    """A filled array, or only the M pixels of the hole, in the order of array[hole]."""
 
-    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced
+    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced; or [M] or [M, C]
     iterations: int  # most of any channel; 0 = solved directly, or nothing to solve
-    unanchored: np.ndarray  # [H, W] bool, hole pixels of components that touch no known pixel
-
-
-@dataclass(frozen=True)
-class HoleSolution:
-    """The pixels of a hole, in the order of array[hole]."""
-
-    values: np.ndarray  # [M] or [M, C]
-    iterations: int
-    unanchored: np.ndarray  # [M] bool
+    unanchored: np.ndarray  # [H, W] or [M] bool, hole pixels of components that touch no known pixel
 
 
 def solve_poisson(
@@ -58,36 +50,19 @@ def solve_poisson(
     *,
     weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor` (or to 0)
     anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
+    only_hole: bool = False,  # for large images with small holes: nothing else is made and returned
 ) -> PoissonSolution:
     """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
 
     This is paper 3.3 with its sign mended (docs/method.md): the solution's gradients are the guidance's, not their
-    opposites. Neighbours that are neither hole nor known, and the
-    image's border, are natural (Neumann): they are dropped on both sides. A pair of pixels of which one has no finite
-    guidance wants no gradient; known pixels that are not finite are not known; weights and anchors that are not
-    finite do not count, nor weights below 1e-30; 1e30 is the most.
+    opposites. Neighbours that are neither hole nor known, and the image's border, are natural (Neumann): they are
+    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels that are
+    not finite are not known; weights and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the
+    most.
 
     A component of the hole that touches no known pixel (and is drawn to no anchor) is reported as unanchored. It takes
     the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
     """
-    hole = np.asarray(hole, bool)
-    solution = solve_hole(hole, known, values, guidance, settings, weight=weight, anchor=anchor)
-    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
-    filled[hole], unanchored[hole] = solution.values, solution.unanchored
-    return PoissonSolution(filled, solution.iterations, unanchored)
-
-
-def solve_hole(
-    hole: np.ndarray,
-    known: np.ndarray,
-    values: np.ndarray,
-    guidance: np.ndarray | None = None,
-    settings: PoissonSettings = PoissonSettings(),
-    *,
-    weight: np.ndarray | None = None,
-    anchor: np.ndarray | None = None,
-) -> HoleSolution:
-    """As `solve_poisson`, for large images with small holes: only the hole's pixels are made and returned."""
     hole = np.asarray(hole, bool)
     window = _window(hole)
 
@@ -97,7 +72,12 @@ def solve_hole(
     soft = None if weight is None else np.asarray(weight)[window]
     task = _Task(hole[window], np.asarray(known, bool)[window], cut(values), cut(guidance), soft, cut(anchor))
     solution = _solve(task, settings)
-    return replace(solution, values=solution.values.reshape(-1, *np.shape(values)[2:]))
+    inside = solution.values.reshape(-1, *np.shape(values)[2:])
+    if only_hole:
+        return replace(solution, values=inside)
+    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
+    filled[hole], unanchored[hole] = inside, solution.unanchored
+    return PoissonSolution(filled, solution.iterations, unanchored)
 
 
 def _window(hole: np.ndarray) -> tuple[Any, ...]:
@@ -105,17 +85,10 @@ def _window(hole: np.ndarray) -> tuple[Any, ...]:
 
     If it saves much, rows and columns between parts of the hole are left out: at least two empty ones still part them.
     """
-    kept, box = [], []
-    for axis in (1, 0):
-        used = hole.any(axis)
-        ring = used.copy()
-        ring[1:] |= used[:-1]
-        ring[:-1] |= used[1:]
-        places = np.flatnonzero(ring)
-        kept.append(places)
-        box.append(slice(places[0], places[-1] + 1) if len(places) else slice(0, 0))
+    kept = [np.flatnonzero(scipy.ndimage.binary_dilation(hole.any(axis), np.ones(3))) for axis in (1, 0)]
+    box = tuple(slice(k[0], k[-1] + 1) if len(k) else slice(0, 0) for k in kept)
     area = (box[0].stop - box[0].start) * (box[1].stop - box[1].start)
-    return np.ix_(*kept) if 2 * len(kept[0]) * len(kept[1]) < area else tuple(box)
+    return np.ix_(*kept) if 2 * len(kept[0]) * len(kept[1]) < area else box
 
 
 class _Task(NamedTuple):
@@ -137,7 +110,7 @@ class _Ties(NamedTuple):
     amounts: np.ndarray  # [T, C] float64, on the right
 
 
-def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
+def _solve(task: _Task, settings: PoissonSettings) -> PoissonSolution:
     h, w = task.hole.shape
     kind = np.zeros((h + 3 - h % 2, w + 3 - w % 2), np.uint8)  # a border, and odd sides: grids nest
     np.multiply(task.known, np.uint8(KNOWN), out=kind[1 : h + 1, 1 : w + 1])
@@ -146,7 +119,7 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
     count, channels = int((runs[:, 2] - runs[:, 1]).sum()), task.values.shape[2]
     result = np.zeros((count, channels))
     if not count:
-        return HoleSolution(result, 0, np.zeros(0, bool))
+        return PoissonSolution(result, 0, np.zeros(0, bool))
 
     # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for. `result` begins
     # as the guidance, and a rim pixel is tied to (known − guidance): see _known_ties.
@@ -175,29 +148,27 @@ def _solve(task: _Task, settings: PoissonSettings) -> HoleSolution:
         # A power of two, so that nothing is rounded: float32 must not underflow
         scale = 2.0 ** np.frexp(np.abs(amounts[:, c] * grids.inverse.reshape(-1)[places]).max())[1]
         converged = False
+        right = amounts[:, c] / scale
         if solve_directly is None:
-            iterations, converged = grids.solve(
-                places, amounts[:, c] / scale, settings.tolerance, settings.most_iterations
-            )
+            iterations, converged = grids.solve(places, right, settings.tolerance, settings.most_iterations)
             most = max(most, iterations)
         if not converged:
             solve_directly = solve_directly or _factorise(kind, grids.inverse)
-            grids.u.reshape(-1)[...] = solve_directly(places, amounts[:, c] / scale)
+            grids.u.reshape(-1)[...] = solve_directly(places, right)
             most = 0
         # The right-hand sides add up to zero in each part. So do strengths times the solution, whatever hangs on
         # how few or weak ties.
         error = np.bincount(part, ties.strengths * grids.u.reshape(-1)[places], len(strength)) / strength
         _add(grids.u, runs, parts, grids.fine.stride, scale, shift[:, c] - scale * error, result[:, c])
-    return HoleSolution(result, most, np.zeros(count, bool))
+    return PoissonSolution(result, most, np.zeros(count, bool))
 
 
 def _known_ties(task: _Task, rim: np.ndarray, start: np.ndarray, absent: np.ndarray | None) -> _Ties:
     """The hole's pixels to their known neighbours, where those are finite."""
     unknowns, rows, columns = rim.T
     known = task.values[rows - 1, columns - 1].astype(np.float64)
-    if not np.isfinite(known).all():
-        sound = np.isfinite(known).all(1)
-        unknowns, rows, columns, known = unknowns[sound], rows[sound], columns[sound], known[sound]
+    sound = np.isfinite(known).all(1)
+    unknowns, rows, columns, known = (a[sound] for a in (unknowns, rows, columns, known))
     amounts = known - start[unknowns]
     if task.guidance is not None:
         beyond = task.guidance[rows - 1, columns - 1]
@@ -234,12 +205,10 @@ def _settle(
     absent: np.ndarray | None,  # [M, C] bool
     task: _Task,
     settings: PoissonSettings,
-) -> HoleSolution:
+) -> PoissonSolution:
     """Unanchored components take their guidance, the rest is solved; pixels without guidance hang on those with."""
     loose = free[parts]
-    usable = np.zeros(len(parts), bool) if task.guidance is None else np.ones(len(parts), bool)
-    if absent is not None:
-        usable &= ~absent.any(1)
+    usable = np.full(len(parts), task.guidance is not None) if absent is None else ~absent.any(1)
     taken = loose & usable
     settled = taken | (loose & (np.bincount(parts, usable) == 0)[parts])
     hole, known, values = task.hole.copy(), task.known.copy(), task.values.astype(np.float64)
@@ -248,7 +217,7 @@ def _settle(
     rest = _solve(task._replace(hole=hole, known=known, values=values), settings)
     result = np.where(taken[:, None], start, start.dtype.type(np.nan))
     result[~settled] = rest.values
-    return HoleSolution(result, rest.iterations, loose)
+    return PoissonSolution(result, rest.iterations, loose)
 
 
 def _factorise(kind: np.ndarray, inverse: np.ndarray) -> Any:
@@ -262,9 +231,8 @@ def _factorise(kind: np.ndarray, inverse: np.ndarray) -> Any:
         neighbour = index[rows + dy, columns + dx]
         linked = np.flatnonzero(neighbour >= 0)
         matrix -= scipy.sparse.csc_matrix((np.ones(len(linked)), (linked, neighbour[linked])), matrix.shape)
-    factor = scipy.sparse.linalg.splu(
-        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True, "DiagPivotThresh": 0.0}
-    )
+    options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+    factor = scipy.sparse.linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", options=options)
 
     def solve(at: np.ndarray, amounts: np.ndarray) -> np.ndarray:
         right, u = np.bincount(at, amounts, inverse.size), np.zeros(inverse.size)

@@ -42,12 +42,8 @@ GAP = 8  # spans go on over gaps of so many places
 DAMPING = 0.9  # of the Jacobi step, against one that could just diverge
 INSIDE, PLAIN = 1, 2  # flags of pixels and nodes: an unknown; its stencil is that of the inner hole
 # PᵀAP in one dimension: what the link d − 1 of the finer node a − 1 gives to the link J − 1 of the node in the middle
-SHARES = np.array(
-    [
-        [[(1 - abs(a) / 2) * max(0, 1 - abs(a + d - 2 * J) / 2) for J in (-1, 0, 1)] for d in (-1, 0, 1)]
-        for a in (-1, 0, 1)
-    ]
-)
+NEAR = (-1, 0, 1)
+SHARES = np.array([[[(1 - abs(a) / 2) * max(0, 1 - abs(a + d - 2 * J) / 2) for J in NEAR] for d in NEAR] for a in NEAR])
 DESCEND, DESCEND_AGAIN, ASCEND, SOLVE = range(4)  # tasks of a cycle
 ONE, TWO = np.uint64(1), np.uint64(2)  # places are unsigned: numba would wrap signed ones, and not vectorise
 
@@ -93,15 +89,14 @@ class Work(NamedTuple):
 
 
 class Multigrid:
-    """The system of a hole, for any number of right-hand sides."""
+    """The system of a hole, for any number of right-hand sides.
 
-    def __init__(
-        self,
-        inside: np.ndarray,  # [rows, columns] uint8, bit 0 set in the hole; odd sides, a border outside the hole
-        runs: np.ndarray,  # [R, ≥ 3] int64: row, first and end column of each run of pixels in the hole
-        places: np.ndarray,  # [T] int64, see places_of
-        strengths: np.ndarray,  # [T], by how much D there is above the number of neighbours in the hole
-    ) -> None:
+    `inside` [rows, columns] uint8 has bit 0 set in the hole, odd sides, and a border outside the hole; `runs` [R, ≥ 3]
+    int64 are row, first and end column of each run of pixels in it. At `places` [T] int64 (places_of), D is above the
+    number of neighbours in the hole by `strengths` [T].
+    """
+
+    def __init__(self, inside: np.ndarray, runs: np.ndarray, places: np.ndarray, strengths: np.ndarray) -> None:
         rows, columns = inside.shape
         stride = row_stride(columns // 2 + 1)
         self.inverse, self.right, self.u = np.zeros((3, 2, rows * stride))
@@ -116,15 +111,12 @@ class Multigrid:
         self.work = Work(*fine_vectors, *np.zeros((3, self.coarse.steps.size), np.float32))
 
     def solve(
-        self,
-        places: np.ndarray,  # [T] int64, always the same
-        amounts: np.ndarray,  # [T], what there is on the right, elsewhere 0; of about unit size
-        tolerance: float,
-        most_iterations: int,
+        self, places: np.ndarray, amounts: np.ndarray, tolerance: float, most_iterations: int
     ) -> tuple[int, bool]:
         """Set `u` [2, rows · stride]; the iterations taken, and whether they converged.
 
-        They have when the residual, each equation divided by its D, is at most `tolerance` times the first one
+        On the right are `amounts` [T], of about unit size, at `places` (always the same), elsewhere 0. They have
+        converged when the residual, each equation divided by its D, is at most `tolerance` times the first one
         (Euclidean norms), or when rounding lets it fall no further.
         """
         self.u[...] = 0
@@ -368,17 +360,10 @@ def _turn(fine, work, beta):
 @inline_kernel
 def _times(stencils, u, k, n):
     """A·u at node k."""
-    return (
-        stencils[0, k] * u[k]
-        + stencils[1, k] * u[k + ONE]
-        + stencils[1, k - ONE] * u[k - ONE]
-        + stencils[2, k] * u[k + n - ONE]
-        + stencils[2, k - n + ONE] * u[k - n + ONE]
-        + stencils[3, k] * u[k + n]
-        + stencils[3, k - n] * u[k - n]
-        + stencils[4, k] * u[k + n + ONE]
-        + stencils[4, k - n - ONE] * u[k - n - ONE]
-    )
+    total = stencils[0, k] * u[k] + stencils[1, k] * u[k + ONE] + stencils[1, k - ONE] * u[k - ONE]
+    total = total + stencils[2, k] * u[k + n - ONE] + stencils[2, k - n + ONE] * u[k - n + ONE]
+    total = total + stencils[3, k] * u[k + n] + stencils[3, k - n] * u[k - n]
+    return total + stencils[4, k] * u[k + n + ONE] + stencils[4, k - n - ONE] * u[k - n - ONE]
 
 
 @kernel
@@ -461,11 +446,17 @@ def _build(flags, fine, nodes, rows, strides, offsets, first_rows, first, spans,
         origin = np.uint64(0) if g == 0 else offsets[g - 1]
         plain = np.uint64(0)  # a node with the stencil of the inner hole
         for i in range(1, nodes[g, 0] + 1):
-            base, r = offsets[g] + np.uint64(i) * strides[g], first_rows[g] + i
+            base, r, end = offsets[g] + np.uint64(i) * strides[g], first_rows[g] + i, 0
             below = origin + np.uint64(2 * i - 1) * m
             _mark(finer, below, m, marks, base, nodes[g, 1])
             first[r] = count
-            count = _span_row(marks, base, nodes[g, 1], spans, count)
+            for j in range(1, nodes[g, 1] + 1):
+                if marks[base + np.uint64(j)]:
+                    if end == 0 or j > end + GAP:
+                        spans[count, 0] = base + np.uint64((j - 1) // 2 * 2 + 1)
+                        count += 1
+                    end = (j + 1) // 2 * 2 + 1
+                    spans[count - 1, 1] = base + np.uint64(end)
             for s in range(first[r], count):
                 for k in range(spans[s, 0], spans[s, 1]):
                     if marks[k] & PLAIN and plain > 0:
@@ -488,7 +479,8 @@ def _build(flags, fine, nodes, rows, strides, offsets, first_rows, first, spans,
 
 @kernel
 def _collapse(finest, finer, fine, stencils, f, m, around, scratch):
-    """around ← the entries [3, 3] of PᵀAP at the node that lies on the finer place f."""
+    """around ← the entries [3, 3] of PᵀAP at the node that lies on the finer place f, from the equations [3, 3]
+    there."""
     equation, beside = scratch[0], scratch[1]
     equation[:], around[:] = 0, 0
     for y in range(3):
@@ -497,9 +489,15 @@ def _collapse(finest, finer, fine, stencils, f, m, around, scratch):
             k = f + np.uint64(y) * m + np.uint64(x) - m - ONE
             if finer[k]:
                 if finest:
-                    _pixel_equation(finer, fine, k, m, equation)
+                    i, j = np.int64(k // m), np.int64(k % m)
+                    equation[1, 1] = 1 / fine.inverse[(i + j) & 1, i * fine.stride + j // 2]
+                    equation[0, 1], equation[2, 1] = -(finer[k - m] & INSIDE), -(finer[k + m] & INSIDE)
+                    equation[1, 0], equation[1, 2] = -(finer[k - ONE] & INSIDE), -(finer[k + ONE] & INSIDE)
                 else:
-                    _node_equation(stencils, k, m, equation)
+                    equation[0, 0], equation[0, 1] = stencils[4, k - m - ONE], stencils[3, k - m]
+                    equation[0, 2], equation[1, 0] = stencils[2, k - m + ONE], stencils[1, k - ONE]
+                    equation[1, 1], equation[1, 2] = stencils[0, k], stencils[1, k]
+                    equation[2, 0], equation[2, 1], equation[2, 2] = stencils[2, k], stencils[3, k], stencils[4, k]
                 for d in range(3):
                     for e in range(3):
                         for J in range(3):
@@ -520,38 +518,6 @@ def _mark(finer, start, n, marks, base, count):
         h, i, j = finer[f + n - ONE], finer[f + n], finer[f + n + ONE]
         some, every = a | b | c | d | e | g | h | i | j, a & b & c & d & e & g & h & i & j
         marks[base + J] = some & INSIDE | every & PLAIN
-
-
-@kernel
-def _span_row(marks, base, columns, spans, count):
-    """Spans of a row of nodes, from `count` on; the count after them."""
-    end = 0
-    for j in range(1, columns + 1):
-        if marks[base + np.uint64(j)]:
-            if end == 0 or j > end + GAP:
-                spans[count, 0] = base + np.uint64((j - 1) // 2 * 2 + 1)
-                count += 1
-            end = (j + 1) // 2 * 2 + 1
-            spans[count - 1, 1] = base + np.uint64(end)
-    return count
-
-
-@kernel
-def _pixel_equation(flags, fine, k, m, equation):
-    """The entries [3, 3] of a pixel's equation."""
-    y, x = np.int64(k // m), np.int64(k % m)
-    equation[1, 1] = 1 / fine.inverse[(y + x) & 1, y * fine.stride + x // 2]
-    equation[0, 1], equation[2, 1] = -(flags[k - m] & INSIDE), -(flags[k + m] & INSIDE)
-    equation[1, 0], equation[1, 2] = -(flags[k - ONE] & INSIDE), -(flags[k + ONE] & INSIDE)
-
-
-@kernel
-def _node_equation(stencils, k, m, equation):
-    """The entries [3, 3] of a node's equation."""
-    equation[0, 0], equation[0, 1] = stencils[4, k - m - ONE], stencils[3, k - m]
-    equation[0, 2], equation[1, 0] = stencils[2, k - m + ONE], stencils[1, k - ONE]
-    equation[1, 1], equation[1, 2] = stencils[0, k], stencils[1, k]
-    equation[2, 0], equation[2, 1], equation[2, 2] = stencils[2, k], stencils[3, k], stencils[4, k]
 
 
 @kernel

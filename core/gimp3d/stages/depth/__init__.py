@@ -6,13 +6,5 @@ views measured of the hole and see past, `prior` scales a relative depth from ou
 
 from .complete import DepthCompletion, complete_depth, complete_disparity
 from .fill import DepthSettings
-from .prior import PriorFit, fit_prior
 
-__all__ = [
-    "DepthCompletion",
-    "DepthSettings",
-    "PriorFit",
-    "complete_depth",
-    "complete_disparity",
-    "fit_prior",
-]
+__all__ = ["DepthCompletion", "DepthSettings", "complete_depth", "complete_disparity"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import scipy.ndimage
 
@@ -16,8 +15,8 @@ from ...solvers.planes import RING
 from ...solvers.poisson import solve_poisson
 from ..masks import ViewMasks
 from .evidence import AGREEMENT, DepthEvidence, gather_depth_evidence
-from .fill import HOLD_OUT, DepthSettings, Measured, choose_plan, fill, hold_out_miss, measure
-from .layers import AROUND, BAND, distance_to, without_front
+from .fill import HOLD_OUT, DepthSettings, Measured, choose_plan, fill, hold_out_miss
+from .layers import AROUND, BAND, background_rim, distance_to, without_front
 from .prior import PriorFit, fit_prior
 
 LEAST_ISLAND = 0.02  # share of the hole that evidence must hold to stand alone before the surface
@@ -56,17 +55,13 @@ def complete_depth(
 
     Evidence clearly behind the surface that the surroundings tell is seen from under it, and dropped. Round the hole,
     pixels whose depth falls through a surface that other views agree on are not trusted: scans have leaks.
-
-    Raises
-    ------
-    IllPosed
-        As `complete_disparity`.
+    Raises IllPosed as `complete_disparity` does.
     """
-    known = without_front(disparity, known, view.target, view.occluder, step=settings.layer_step)
+    known = without_front(disparity, known, view.target, view.occluder, settings.layer_step)
     ring = known & (distance_to(view.target) <= RING)
     measured = gather_depth_evidence(view, views, ring)
     fallen = ring & (disparity < (1 - AGREEMENT) * measured.disparity)
-    known = without_front(disparity, known, view.target, fallen, MOSTLY, settings.layer_step) & ~fallen
+    known = without_front(disparity, known, view.target, fallen, settings.layer_step, MOSTLY) & ~fallen
     evidence = _without(measured, ~view.target)
     relative = None if prior is None else relative_disparity(prior, disparity, known)
 
@@ -115,11 +110,8 @@ def complete_disparity(
     in telling planes and layers. Known pixels that are NaN, infinite or negative are not known. A part of the hole
     that has no rim takes the prior, aligned to the ring, or the nearest depth.
 
-    Raises
-    ------
-    IllPosed
-        If the hole has no known rim at all and no prior that fits what is known; or if planes were insisted
-        on and there are none.
+    Raises IllPosed if the hole has no known rim at all and no prior that fits what is known; or if planes were insisted
+    on and there are none.
     """
     with np.errstate(invalid="ignore"):
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
@@ -130,12 +122,14 @@ def complete_disparity(
     if evidence is not None:
         usable = hole & np.isfinite(evidence.disparity) & (evidence.disparity > 0) & (evidence.weight > 0)
         weight[usable], scene[usable] = evidence.weight[usable], evidence.disparity[usable]
-    around = measure(scene, trusted, hole, weight, settings)
-    guide, fit, on_line = None, PriorFit(0.0, 0.0, 1.0, ""), trusted
+    around = Measured(scene, background_rim(scene, trusted, hole, settings.layer_step), hole, weight)
+    guide, fit, sources = None, PriorFit(0.0, 0.0, 1.0, ""), [trusted]
     if prior is not None:
         fit = fit_prior(scene, around.measured, hole, prior, settings, on_ring=bool(around.touching.any()))
         if fit.scale:
-            guide, on_line = fit.guide_scale * _without_gaps(prior), trusted & fit.agrees(prior, scene)
+            gaps = ~np.isfinite(prior)
+            whole = solve_poisson(gaps, ~gaps, prior).values
+            guide, sources = fit.scale / fit.believed * whole, [trusted, trusted & fit.agrees(prior, scene)]
     if guide is None and not around.touching.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
     result, trust = scene.copy(), np.ones(hole.shape)
@@ -144,10 +138,9 @@ def complete_disparity(
         near = (trusted & scipy.ndimage.binary_dilation(part)).any() or weight[part].any()
         window = bounds(part, RING + 1) if near else np.s_[:, :]
         inside, evident = part[window], (weight * part)[window]
-        alone = measure(scene[window], trusted[window], inside, evident, settings)
-        guided = None
-        if guide is not None:
-            guided = measure(scene[window], on_line[window], inside, evident, settings, guide[window])
+        rims = [background_rim(scene[window], a[window], inside, settings.layer_step) for a in sources]
+        alone = Measured(scene[window], rims[0], inside, evident)
+        guided = None if guide is None else replace(alone, rim=rims[1], guide=guide[window])
         own = replace(settings, surface="harmonic") if part.sum() <= settings.small_part else settings
         found = _completed_part(alone, guided, fit, own, first=not done)
         result[window][inside], trust[window][inside] = found.disparity[inside], found.trust[inside]
@@ -155,7 +148,7 @@ def complete_disparity(
     confidence = min([float(trust[hole].mean()), *(p.sure for p in done if p.pixels > LARGE * hole.sum())])
     reasons = [fit.reason, *(note for part in done for note in part.notes)]
     reason = "; ".join(r for r in dict.fromkeys(reasons) if r)
-    used = fit.scale if guide is None else done[0].believed * fit.guide_scale
+    used = fit.scale if guide is None else done[0].believed * (fit.scale / fit.believed)
     fit = replace(fit, scale=used, confidence=confidence, reason=reason)
     return _completion(result, fit, trust, sum(part.clamped for part in done))
 
@@ -177,18 +170,17 @@ def _completed_part(
     alone: Measured, guided: Measured | None, fit: PriorFit, settings: DepthSettings, first: bool
 ) -> _Part:
     """What is round one part continued into it, with the prior as far as that is believed."""
-    if guided is None:
-        around, believed, notes = alone, 0.0, []
-        plan = choose_plan(alone, settings, insist=first)
-        missed, filled = hold_out_miss(alone, plan, settings, alone.rim), fill(alone, plan, settings)
-    else:
+    around = alone
+    if guided is not None:
         around = guided if guided.touching.any() else replace(alone, guide=guided.guide)
-        plan = choose_plan(around, settings)
-        missed = hold_out_miss(around, plan, settings, around.rim)
-        filled, believed = _as_far_as_believed(fill(around, plan, settings), missed, fit, around, alone, settings)
-        notes = [f"prior believed by {believed:.0%}"] if believed <= 0.95 else []
-    notes = [*notes, plan.reason] if first else []
-    share, pixels = 1.0, int(around.hole.sum())
+    plan = choose_plan(around, settings, insist=first)
+    missed, filled = hold_out_miss(around, plan, settings, around.rim), fill(around, plan, settings)
+    believed, share, pixels = 0.0, 1.0, int(around.hole.sum())
+    notes = [plan.reason] if first else []
+    if guided is not None:
+        filled, believed = _as_far_as_believed(filled, missed, fit, around, alone, settings)
+        if first and believed <= 0.95:
+            notes.insert(0, f"prior believed by {believed:.0%}")
     undecided = around.hole & ~np.isfinite(filled)
     if undecided.any() and around.guide is not None:
         filled, share = np.where(undecided, around.guide + fit.shift, filled), 0.5
@@ -197,37 +189,30 @@ def _completed_part(
         nearest = scipy.ndimage.distance_transform_edt(~around.measured, return_distances=False, return_indices=True)
         filled, share = np.where(undecided, around.disparity[tuple(nearest)], filled), 0.3
         notes.append("a part of the hole has no rim: nearest depth used")
-    filled, clamped = _clamped(filled, around)
-    if clamped > LARGE * pixels:
-        share *= 0.5
-        notes.append(f"{clamped} pixels clamped to the ring's range")
-    sure = max(fit.confidence, believed)
-    return _Part(filled, share * sure * _trust(around, missed), pixels, min(share, sure), believed, clamped, notes)
-
-
-def _clamped(filled: np.ndarray, around: Measured) -> tuple[np.ndarray, int]:
-    """The disparities kept to the ring's range, and how many of the hole's were not in it."""
     ring = around.measured & (around.distance <= BAND)
     beside = around.disparity[ring if ring.any() else around.measured]
     finite = beside[beside > 0]
     low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
     if (beside == 0).any():  # where the ring shows sky, so far means infinitely far
-        filled = np.where(filled < low, 0.0, filled)
-        low = 0.0
-    return np.clip(filled, low, high), int((around.hole & ((filled < low) | (filled > high))).sum())
+        filled, low = np.where(filled < low, 0.0, filled), 0.0
+    clamped = int((around.hole & ((filled < low) | (filled > high))).sum())
+    if clamped > LARGE * pixels:
+        share *= 0.5
+        notes.append(f"{clamped} pixels clamped to the ring's range")
+    sure = max(fit.confidence, believed)
+    # From the miss on a hold-out band and the distance to what is measured
+    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + distance_to(around.measured) / HOLD_OUT)
+    trust = share * sure * (1 / (1 + expected / EXPECTED))
+    return _Part(np.clip(filled, low, high), trust, pixels, min(share, sure), believed, clamped, notes)
 
 
 def _as_far_as_believed(
-    filled: np.ndarray,  # [H, W] the hole's disparity with the prior
-    missed: float,  # by it on the hold-out band
-    fit: PriorFit,
-    guided: Measured,
-    alone: Measured,  # without the prior
-    settings: DepthSettings,
+    filled: np.ndarray, missed: float, fit: PriorFit, guided: Measured, alone: Measured, settings: DepthSettings
 ) -> tuple[np.ndarray, float]:
     """The hole with as much of the prior as its fit and its miss on a hold-out band allow, and how much that is.
 
-    The fit tells a prior's scale, but not that its error is larger than what planes or a plate miss without it.
+    `filled` [H, W] is the hole's disparity with the prior, `alone` what is measured without it. The fit tells a prior's
+    scale, but not that its error is larger than what planes or a plate miss without it.
     """
     if settings.scale_factor is not None:
         return filled, fit.believed
@@ -246,12 +231,6 @@ def _falling(ratio: float) -> float:
     return 1 / (1 + ratio**8)
 
 
-def _without_gaps(prior: np.ndarray) -> np.ndarray:
-    """The prior with its NaN pixels interpolated."""
-    gaps = ~np.isfinite(prior)
-    return solve_poisson(gaps, ~gaps, prior).values
-
-
 def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     """The hole's connected parts, the largest first: each has its own surroundings. Small ones together come last."""
     labels, count = scipy.ndimage.label(hole, AROUND)
@@ -262,15 +241,7 @@ def _parts(hole: np.ndarray, small: int) -> list[np.ndarray]:
     return [*large, rest] if rest.any() else large
 
 
-def _trust(around: Measured, missed: float) -> np.ndarray:
-    """[H, W]: each pixel's confidence, from the miss on a hold-out band and the distance to what is measured."""
-    far = cv2.distanceTransform((~around.measured).astype(np.uint8), cv2.DIST_L2, 5)
-    expected = (EXPECTED if np.isnan(missed) else missed) * (0.5 + far / HOLD_OUT)
-    return 1 / (1 + expected / EXPECTED)
-
-
 def _completion(disparity: np.ndarray, fit: PriorFit, trust: np.ndarray, clamped: int) -> DepthCompletion:
-    disparity = disparity.astype(np.float32)
+    disparity, trust = disparity.astype(np.float32), trust.astype(np.float32)
     depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
-    trust = trust.astype(np.float32)
     return DepthCompletion(disparity, depth, trust, fit.scale, fit.ring, fit.line, clamped, fit.confidence, fit.reason)

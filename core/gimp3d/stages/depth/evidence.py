@@ -30,15 +30,12 @@ class DepthEvidence:
     weight: np.ndarray  # [H, W] float32 in [0, 1], 0 = none
 
 
-def gather_depth_evidence(
-    view: ViewMasks,  # the reference
-    views: Sequence[ViewMasks],  # the others; the reference among them does not count
-    ring: np.ndarray | None = None,  # [H, W] bool, pixels off the hole that are asked about too
-) -> DepthEvidence:
-    """Disparities of the reference's hole that other views measured, the nearest surface on which views agree.
+def gather_depth_evidence(view: ViewMasks, views: Sequence[ViewMasks], ring: np.ndarray | None = None) -> DepthEvidence:
+    """Disparities of the hole of `view`, the reference, that others measured: the nearest surface on which views agree.
 
-    Taken are the pixels of other views whose first surface is there with and without the object, off depth edges. They
-    are carried into the reference; the samples of a pixel fall into groups that agree, and the nearest group of enough
+    The reference among `views` does not count; `ring` [H, W] bool are pixels off the hole asked about too. Taken are
+    the pixels of other views whose first surface is there with and without the object, off depth edges. They are
+    carried into the reference; the samples of a pixel fall into groups that agree, and the nearest group of enough
     views gives its median. What lies just behind a nearer neighbour shows through a gap between samples: dropped.
     """
     others = [v for v in views if v.camera.id != view.camera.id]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -14,7 +15,7 @@ from ...schema import Many, Positive, Signed
 from ...solvers.planes import INLIER, RING, PlanarPart, planar_surfaces
 from ...solvers.poisson import solve_poisson
 from ...solvers.thin_plate import UNKNOWNS, thin_plate
-from .layers import LEAST_LAYER, STEP, background_rim, distance_to, divided, separated
+from .layers import LEAST_LAYER, STEP, distance_to, divided, separated
 
 PLANE_SHARE = 0.65  # of the ring that must lie on planes for planes to be continued
 ROUGH = (1.0, 2.0, 4.0)  # times INLIER, tried until so much does: depths of real scans scatter by 9 %, of made ones 1 %
@@ -44,11 +45,15 @@ class Measured:
     """A hole and what is measured round and in it."""
 
     disparity: np.ndarray  # [H, W] float64: the scene's on the rim, the evidence's in the hole
-    rim: np.ndarray  # [H, W] bool, known pixels of the background
+    rim: np.ndarray  # [H, W] bool, known pixels of the background (`background_rim`)
     hole: np.ndarray  # [H, W] bool
     weight: np.ndarray  # [H, W] of the evidence in the hole, 0 = none
-    distance: np.ndarray  # [H, W] px to the hole
     guide: np.ndarray | None = None  # [H, W] the prior in the scene's scale; only the difference to it is continued
+
+    @cached_property
+    def distance(self) -> np.ndarray:
+        """[H, W] px to the hole."""
+        return distance_to(self.hole)
 
     @property
     def measured(self) -> np.ndarray:
@@ -59,19 +64,6 @@ class Measured:
     def touching(self) -> np.ndarray:
         """[H, W] bool: what bounds the hole's unknown pixels."""
         return (self.rim & scipy.ndimage.binary_dilation(self.hole)) | (self.weight > 0)
-
-
-def measure(
-    disparity: np.ndarray,  # [H, W] float64
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    weight: np.ndarray,  # [H, W], 0 off the hole
-    settings: DepthSettings,
-    guide: np.ndarray | None = None,
-) -> Measured:
-    """What bounds a hole, occluders left out (`background_rim`)."""
-    rim = background_rim(disparity, known, hole, settings.layer_step)
-    return Measured(disparity, rim, hole, weight, distance_to(hole), guide)
 
 
 @dataclass(frozen=True)
@@ -91,17 +83,10 @@ class Plan:
     reason: str
 
 
-def choose_plan(
-    around: Measured,
-    settings: DepthSettings,
-    insist: bool = True,  # on planes, if the settings do
-) -> Plan:
+def choose_plan(around: Measured, settings: DepthSettings, insist: bool) -> Plan:
     """Planes, a thin plate or a membrane, as the settings say; "auto" takes what misses a hold-out band by less.
 
-    Raises
-    ------
-    IllPosed
-        If planes are insisted on and there are none.
+    Raises IllPosed if the settings and `insist` insist on planes and there are none.
     """
     kind = "harmonic" if settings.surface == "harmonic" else "smooth"
     if around.guide is not None:  # it knows of steps itself
@@ -146,8 +131,7 @@ def _layers(around: Measured, surfaces: tuple[PlanarPart, ...], split: bool, ste
     loose = index == len(surfaces)
     touching = around.touching
     if (loose & touching).any() and (not surfaces or (loose & touching).sum() >= LEAST_LAYER * touching.sum()):
-        parts = separated(d, loose, loose & touching, step) if split else [loose]
-        layers += [_Layer(part) for part in parts]
+        layers += map(_Layer, separated(d, loose, loose & touching, step) if split else [loose])
     return tuple(layers)
 
 
@@ -164,11 +148,11 @@ def fill(around: Measured, plan: Plan, settings: DepthSettings) -> np.ndarray:
         own = around.hole & (part == k)
         if not own.any():
             continue
-        if layer.surface is not None:
-            on, surface = layer.on & layer.surface.on, layer.surface.disparity
-            values = surface + _deviation(around, layer, on, surface, own)
-        else:
+        if layer.surface is None:
             values = _continued(around, layer, own, plan.kind, settings)
+        else:
+            surface = layer.surface.disparity
+            values = surface + _deviation(around, layer, layer.on & layer.surface.on, surface, own)
         filled[own] = values[own]
     return filled
 
@@ -195,18 +179,13 @@ def _continued(around: Measured, layer: _Layer, own: np.ndarray, kind: str, sett
     return guide + plate + np.nan_to_num(rest)
 
 
-def _deviation(
-    around: Measured,
-    layer: _Layer,
-    on: np.ndarray,  # [H, W] bool, what of the layer lies on the surface
-    surface: np.ndarray,  # [H, W] disparity
-    own: np.ndarray,
-) -> np.ndarray:
+def _deviation(around: Measured, layer: _Layer, on: np.ndarray, surface: np.ndarray, own: np.ndarray) -> np.ndarray:
     """[H, W]: what the ring deviates from a surface, averaged along it and extended harmonically into the hole.
 
-    The pixels that touch the hole are biased by the object's haze: averaging over the whole ring is 4 to 6 times as
-    accurate as meeting them exactly, measured on scenes with known truth. On real scans, whose depths swirl, a plate
-    leads the deviations' slopes into the hole: averaging is 4 times as accurate with a prior that is right.
+    What of the layer lies on the surface, a disparity, is `on`. The pixels that touch the hole are biased by the
+    object's haze: averaging over the whole ring is 4 to 6 times as accurate as meeting them exactly, measured on scenes
+    with known truth. On real scans, whose depths swirl, a plate leads the deviations' slopes into the hole: averaging
+    is 4 times as accurate with a prior that is right.
     """
     counted = (on & around.measured).astype(np.float64)
     weight = cv2.GaussianBlur(counted, (0, 0), AVERAGE)
@@ -223,8 +202,7 @@ def hold_out_miss(around: Measured, plan: Plan, settings: DepthSettings, where: 
     """
     band = around.rim & (around.distance <= HOLD_OUT) & (around.disparity > 0)
     wider = around.hole | (around.distance <= HOLD_OUT) & ~(around.rim & ~band)
-    none = np.zeros(wider.shape)
-    held = replace(around, rim=around.rim & ~band, hole=wider, distance=distance_to(wider), weight=none)
+    held = replace(around, rim=around.rim & ~band, hole=wider, weight=np.zeros(wider.shape))
     tested = band & (around.distance >= SKIN) & where
     if min(held.rim.sum(), tested.sum()) < LEAST_PIXELS:
         return float("nan")

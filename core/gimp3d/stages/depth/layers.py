@@ -20,12 +20,8 @@ FRONT = 0.05  # share of a part of the ring that must be seen to be in front for
 STRAIGHT = 0.97  # share of two layers' pixels that a line must part for it to be their border
 
 
-def steps(
-    disparity: np.ndarray,  # [H, W]
-    known: np.ndarray,  # [H, W] bool
-    step: float = STEP,  # relative
-) -> np.ndarray:
-    """[H, W] bool: known pixels within 2 px of a step.
+def steps(disparity: np.ndarray, known: np.ndarray, step: float = STEP) -> np.ndarray:
+    """[H, W] bool: known pixels within 2 px of a relative step.
 
     The measure is the second difference over ±2 px, which is 0 on planes at any slant and the step's height at a
     step, also one blurred over a pixel or two.
@@ -41,12 +37,7 @@ def steps(
     return found & known
 
 
-def background_rim(
-    disparity: np.ndarray,  # [H, W]
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    step: float = STEP,
-) -> np.ndarray:
+def background_rim(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray, step: float = STEP) -> np.ndarray:
     """[H, W] bool: the known pixels that may bound the hole, that is, not those of occluders in front of it.
 
     Layers are the parts of the band round the hole between steps. Taken from the farthest on, those that together make
@@ -79,17 +70,13 @@ def background_rim(
 
 
 def without_front(
-    disparity: np.ndarray,  # [H, W]
-    known: np.ndarray,  # [H, W] bool
-    hole: np.ndarray,  # [H, W] bool
-    front: np.ndarray,  # [H, W] bool, pixels seen to lie in front of the object, at its outline; or wrong
-    share: float = FRONT,  # of a part of the ring that must be front for all of it to go
-    step: float = STEP,
+    disparity: np.ndarray, known: np.ndarray, hole: np.ndarray, front: np.ndarray, step: float, share: float = FRONT
 ) -> np.ndarray:
     """[H, W] bool: the known pixels without surfaces that must not be continued into the hole.
 
     Those are surfaces that hide the object itself, as the hole lies behind them, and surfaces that are not there. The
-    ring round the hole is cut at steps into parts; a part goes if the given share of it is `front`.
+    ring round the hole is cut at steps into parts; a part goes if the given share of it is `front` [H, W] bool: pixels
+    seen to lie in front of the object, at its outline, or wrong.
     """
     if not (front & known).any():
         return known
@@ -102,15 +89,11 @@ def without_front(
     return known & ~gone[labels] & ~edge
 
 
-def separated(
-    disparity: np.ndarray,  # [H, W]
-    measured: np.ndarray,  # [H, W] bool, the pixels to be parted
-    rim: np.ndarray,  # [H, W] bool, those of them that touch the hole
-    step: float = STEP,
-) -> list[np.ndarray]:
+def separated(disparity: np.ndarray, measured: np.ndarray, rim: np.ndarray, step: float = STEP) -> list[np.ndarray]:
     """The layers [H, W] bool into which steps part the measured pixels; one if nothing parts them for certain.
 
-    Only parts that hold enough of the rim count, and only those between which the disparity really steps.
+    Only parts that hold enough of the rim, the pixels that touch the hole, count, and only those between which the
+    disparity really steps.
     """
     labels, _ = scipy.ndimage.label(measured & ~steps(disparity, measured, step), AROUND)
     held = np.bincount(labels[rim], minlength=labels.max() + 1)
@@ -143,15 +126,13 @@ def _stepped(disparity: np.ndarray, a: np.ndarray, b: np.ndarray, step: float) -
     return min(apart, level) > step * max(float(np.median(v)) for v in values)
 
 
-def divided(
-    hole: np.ndarray,  # [H, W] bool
-    seeds: np.ndarray,  # [H, W] int, the layer of rim pixels and of what is measured in the hole; −1 elsewhere
-    rings: list[np.ndarray],  # per layer [H, W] bool, all its measured pixels
-) -> np.ndarray:
+def divided(hole: np.ndarray, seeds: np.ndarray, rings: list[np.ndarray]) -> np.ndarray:
     """[H, W] int: the layer of each of the hole's pixels.
 
-    Where a straight line parts the measured pixels of two layers, it parts the hole: edges of things that people build
-    are straight. Otherwise each pixel goes to the layer with the largest harmonic extension of its share of the rim.
+    `seeds` [H, W] int are the layers of rim pixels and of what is measured in the hole, −1 elsewhere; `rings` [H, W]
+    bool all measured pixels of each layer. Where a straight line parts the measured pixels of two layers, it parts the
+    hole: edges of things that people build are straight. Otherwise each pixel goes to the layer with the largest
+    harmonic extension of its share of the rim.
     """
     present = np.unique(seeds[seeds >= 0])
     if len(present) < 2:

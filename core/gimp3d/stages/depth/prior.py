@@ -25,7 +25,7 @@ MOST = 2.0  # times the fitted scale; a prior's errors flatten the fit, which it
 class PriorFit:
     """How a relative prior turns into the scene's disparity: scale · prior + shift. Scale 0: not at all."""
 
-    scale: float  # s_f
+    scale: float  # s_f; the prior's own, where it is believed, is scale / believed
     shift: float  # matters only where the hole has no rim
     confidence: float
     reason: str
@@ -33,11 +33,6 @@ class PriorFit:
     line: tuple[float, float] = (0.0, 0.0)  # (slope, offset) fitted to `ring`
     believed: float = 1.0  # how much of the hole is the prior's; the rest is what is filled in without it
     error: float = float("inf")  # in disparity, beyond which a pixel is not on the line
-
-    @property
-    def guide_scale(self) -> float:
-        """The scale that the prior has where it is believed. A membrane of it, shared with none, has s_f."""
-        return self.scale / self.believed
 
     def agrees(self, prior: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """Bool, of any shape: what lies on the line, or what the prior says nothing of."""
