@@ -138,7 +138,9 @@ def find_planes(
     all_planes = [plane for plane, _ in sought]
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), diagonal) for plane, own in sought]
     found = [(*_settled(claim, levels), claim) for claim in claims]
-    found = [(*_best_known(claim, plane, best, [p for _, p, _ in found], textures), claim) for best, plane, claim in found]
+    found = [
+        (*_best_known(claim, plane, best, [p for _, p, _ in found], textures), claim) for best, plane, claim in found
+    ]
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
     for _, plane, claim in found:
