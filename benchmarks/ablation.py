@@ -26,7 +26,7 @@ from gimp3d.solvers.exemplar import EDGE
 from .command import kept, parser_of, say, told_in_one_line, write
 from .scenes import MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
 from .tables import Row, Section, markdown
-from .timing import about, machine, replaced, timed
+from .timing import Watch, about, machine, replaced
 
 SCENES = (*MADE, "desk_shadow", "corner_shadow", *REAL)
 GIVEN, BUILT_IN = "given", "built-in"  # the first test view's true picture is the reference, or none is given
@@ -116,8 +116,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
 
 
 def main() -> None:
-    parser = parser_of(__doc__, "ablation", data=True, quick="one made scene, two rules")
-    parser.add_argument("--scenes", default=",".join(SCENES), help="folders of DATA, separated by commas")
+    parser = parser_of(__doc__, "ablation", data=True, quick="one made scene, two rules", scenes=",".join(SCENES))
     parser.add_argument("--rules", nargs="*", default=[], metavar="WORD", help="rules that hold one of these words")
     parser.add_argument("--picture", nargs="*", default=[GIVEN, BUILT_IN], choices=[GIVEN, BUILT_IN])
     given = parser.parse_args()
@@ -145,12 +144,13 @@ def measured(scene: Scene, picture: str, switches: Sequence[Switch]) -> Row:
     try:
         settings = changed(PRESETS[PRESET], switches)
         with switched_off(switches):
-            results: list[Any] = []
-            wall, cpu = timed(lambda: results.append(removal(scene, settings, reference, true_picture)))
+            watch = Watch()
+            result = removal(scene, settings, reference, true_picture)
+            wall, cpu = watch.lap()
     except (BadInput, IllPosed) as error:
         return {"refused": str(error)}
-    found = mean_psnrs(scene, filled(scene.gaussians, results[0]), scene.test[1:])
-    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(results[0].added or ())}
+    found = mean_psnrs(scene, filled(scene.gaussians, result), scene.test[1:])
+    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(result.added or ())}
 
 
 def changed(settings: RemovalSettings, switches: Sequence[Switch]) -> RemovalSettings:
@@ -198,18 +198,17 @@ def sections(cells: dict[tuple[str, str, str], Row], pictures: Sequence[str]) ->
         for rule in dict.fromkeys(r for _, p, r in cells if p == picture):
             of = [(cells[s, picture, ""], cells[s, picture, rule]) for s in scenes if (s, picture, rule) in cells]
             done = [(b, c) for b, c in of if "refused" not in b and "refused" not in c]
-            line = [rule or "as it is"]
+            line, form = [rule or "as it is"], "{:+.2f}" if rule else "{:.2f}"
             for mask in MASKS:
-                found = [c[mask] if not rule else c[mask] - b[mask] for b, c in done]
-                form = "{:+.2f}" if rule else "{:.2f}"
+                found = [c[mask] - b[mask] if rule else c[mask] for b, c in done]
                 line += [form.format(f(found)) if found else "–" for f in (np.mean, min, max)]
             seconds = [c["cpu_s"] - (b["cpu_s"] if rule else 0) for b, c in done]
             line.append(f"{np.mean(seconds):+.1f}" if seconds else "–")
-            for b, c in of:
-                if rule:
-                    line.append(_cell(c, b))
-                else:
-                    line.append(b.get("refused") or f"{b['mask']:.2f} / {b['unseen']:.2f} ({b['seconds']:.0f} s)")
+            if rule:
+                line += [_cell(c, b) for b, c in of]
+            else:
+                whole = "{mask:.2f} / {unseen:.2f} ({seconds:.0f} s)"
+                line += [b.get("refused") or whole.format(**b) for b, _ in of]
             lines.append(line + [""] * (len(scenes) - len(of)))
         head = ["rule switched off", *(f"{m}: {w}" for m in MASKS for w in ("mean", "worst", "best")), "CPU s", *scenes]
         yield Section(

@@ -17,11 +17,13 @@ ASSETS = ROOT / "assets"
 DATA = ROOT.parent / "shared" / "data" / "withwithout"
 
 
-def parser_of(words: str, name: str, data: bool = False, quick: str = "") -> argparse.ArgumentParser:
-    """The options that benchmarks share: --out, and where wanted the folder of scenes and --quick."""
+def parser_of(words: str, name: str, data: bool = False, quick: str = "", scenes: str = "") -> argparse.ArgumentParser:
+    """The options that benchmarks share: --out, and where wanted the folder of scenes, --scenes and --quick."""
     parser = argparse.ArgumentParser(prog=f"benchmarks.{name}", description=(words or "").split("\n\n")[0])
     if data:
         parser.add_argument("data", nargs="?", type=Path, default=DATA, help="scenes with and without the object")
+    if scenes:
+        parser.add_argument("--scenes", default=scenes, help="folders of DATA, separated by commas")
     if quick:
         parser.add_argument("--quick", action="store_true", help=quick)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / f"bench_{name}")

@@ -49,9 +49,7 @@ CHARTED = {  # from the best to the worst kind
 
 
 def main() -> None:
-    parser = parser_of(__doc__, "depth", data=True, quick="one view of each scene")
-    parser.add_argument("--scenes", default=",".join(MADE), help="names, separated by commas")
-    given = parser.parse_args()
+    given = parser_of(__doc__, "depth", data=True, quick="one view of each scene", scenes=",".join(MADE)).parse_args()
     scenes, results = read_scenes(given.data, given.scenes, needs_truth=True), {"machine": machine()}
     results["scenes"] = [row for scene in scenes for row in scene_cases(scene, 1 if given.quick else None)]
     words = markdown("Depth completion", about(results["machine"]), sections(results["scenes"]))
@@ -60,22 +58,15 @@ def main() -> None:
     draw(results, (ASSETS if whole else given.out) / "depth_error.svg")
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, ...], size: float) -> np.ndarray:
-    """Gaussian noise of standard deviation 1, blurred to a size in pixels."""
-    noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), size)
-    return noise / noise.std()
-
-
 def prior_of(
-    truth: np.ndarray,  # [H, W] disparity
-    rng: np.random.Generator,
-    gain: float,
-    shift: float = 0.0,
-    bias: float = 0.0,  # smooth errors of σ 14 px, as a share of the disparity's range
-    noise: float = 0.0,  # white noise, as a share of the range
+    truth: np.ndarray, rng: np.random.Generator, gain: float, shift: float = 0.0, bias: float = 0.0, noise: float = 0.0
 ) -> np.ndarray:
-    """A relative disparity: (truth + errors) / gain + shift, so that `gain` is the s_f of a prior without errors."""
-    errors = bias * smooth_noise(rng, truth.shape, 14) + noise * rng.standard_normal(truth.shape)
+    """A relative disparity [H, W], (truth + errors) / gain + shift: `gain` is the s_f of a prior without errors.
+
+    `bias` is of smooth errors (σ 14 px), `noise` of white ones, both as shares of the disparity's range.
+    """
+    smooth = cv2.GaussianBlur(rng.standard_normal(truth.shape), (0, 0), 14)
+    errors = bias * (smooth / smooth.std()) + noise * rng.standard_normal(truth.shape)
     return (truth + np.ptp(truth) * errors) / gain + shift
 
 
@@ -85,19 +76,18 @@ def scene_cases(scene: Scene, most: int | None) -> Iterator[Row]:
         masks = find_masks(scene.gaussians, scene.region, [*scene.train, camera])
         view = next(v for v in masks.views if v.camera.id == camera.id)
         others = [v for v in masks.views if v.camera.id != camera.id]
-        truth, unseen = scene.depth(camera), scene.unseen(camera)
+        truth, known = scene.depth(camera), rim(view)
         there = np.isfinite(truth) & (truth > 0)
-        known = rim(view)
         ring = errors(view.depth_after, truth, known & (distance_to(view.target) <= RING) & there)
         for way, complete in ways(view, others, known, truth).items():
             try:
                 found = complete()
             except IllPosed:
                 continue
-            hole = errors(found.depth, truth, view.target & there)
-            never = errors(found.depth, truth, view.target & unseen & there)
+            hole = view.target & there
             row = {"scene": scene.name, "view": output_name(camera.id), "way": way, "ring": ring}
-            yield row | {"hole": hole, "unseen": never, "reason": found.reason}
+            row |= {"hole": errors(found.depth, truth, hole)}
+            yield row | {"unseen": errors(found.depth, truth, hole & scene.unseen(camera)), "reason": found.reason}
 
 
 def errors(depth: np.ndarray, truth: np.ndarray, counted: np.ndarray) -> dict[str, float]:
@@ -106,11 +96,8 @@ def errors(depth: np.ndarray, truth: np.ndarray, counted: np.ndarray) -> dict[st
         return dict.fromkeys(("median", "p95", "bias"), float("nan"))
     with np.errstate(divide="ignore", invalid="ignore"):
         off = 100 * np.where(depth[counted] > 0, depth[counted] / truth[counted] - 1, 1.0)
-    return {
-        "median": float(np.median(abs(off))),
-        "p95": float(np.percentile(abs(off), 95)),
-        "bias": float(np.median(off)),
-    }
+    median, p95, bias = np.median(abs(off)), np.percentile(abs(off), 95), np.median(off)
+    return {"median": float(median), "p95": float(p95), "bias": float(bias)}
 
 
 def ways(

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -31,18 +30,8 @@ CASES_OF = {  # tests that stand for more than one case
 }
 
 
-@dataclass(frozen=True)
-class Row:
-    """What is tried, by which tests, and what has to hold."""
-
-    what: str
-    tests: str
-    holds: str
-    chosen: str = ""  # as pytest's -k
-
-
-ROWS = (
-    Row(
+ROWS = (  # what is tried, by which tests, what has to hold, and which of these tests, as pytest's -k
+    (
         "wrong inputs: files, options, values, library calls",
         "tests/core/test_schema.py tests/core/io tests/core/test_box.py tests/core/test_camera.py "
         "tests/e2e/test_command_line.py tests/core/priors/test_servers.py tests/core/priors/test_monodepth.py",
@@ -50,61 +39,59 @@ ROWS = (
         "refused or bad or no_setting or no_other_setting or no_sensible or no_scene or damaged or truncated or "
         "lies or memory or description or larger or words_are_checked or told",
     ),
-    Row("jobs and files that reach out, or run something", "tests/core/test_job.py", "refused before any write"),
-    Row(
+    ("jobs and files that reach out, or run something", "tests/core/test_job.py", "refused before any write", ""),
+    (
         "faults: targets, devices, links, streams, memory, stage files",
         "tests/core/test_files.py tests/e2e/test_faults.py",
         "the exit code of the contract, OUT as it was",
         "not any_moment and not killed_removal",
     ),
-    Row(
+    (
         "kills: SIGINT, SIGTERM, SIGHUP, SIGKILL at moments spread over a run",
         "tests/e2e/test_faults.py",
         "OUT is the old or the new one, whole; a run goes on to the same bytes",
         "any_moment or killed_removal",
     ),
-    Row(
+    (
         "moved scenes: units, shifts, turns; filled by Telea",
         "tests/stability/test_units.py",
         f"the same picture to {ALIKE} dB",
         "not built_in and not power",
     ),
-    Row(
+    (
         "some of them, filled by the built-in fill",
         "tests/stability/test_units.py",
         f"to {ALIKE_BUILT_IN} dB; the same chart to the byte where units are powers of two apart",
         "built_in or power",
     ),
-    Row("changed files, a few for every reader", "tests/fuzz", "read or refused", "not minute"),
+    ("changed files, a few for every reader", "tests/fuzz", "read or refused", "not minute"),
 )
 
 
 def main() -> int:
-    parser = parser_of(__doc__, "faults")
-    parser.add_argument("--fuzz", type=Path, default=ROOT / "build" / "fuzz")
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    out = parser_of(__doc__, "faults").parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
     # A shell's background job ignores Ctrl-C, and so would every program that is started here and interrupted.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     lines, wrong = [], 0
-    for row in ROWS:
-        say(row.what)
-        tried, lost, seconds = run(row, given.out / "results.xml")
+    for what, tests, holds, chosen in ROWS:
+        say(what)
+        tried, lost, seconds = run(tests, chosen, out / "results.xml")
         say(f"{tried:,} tried, {lost} lost, {seconds:.0f} s")
         wrong += lost
-        lines.append([row.what, row.holds, f"{tried:,}", lost, f"{seconds:.0f}"])
+        lines.append([what, holds, f"{tried:,}", lost, f"{seconds:.0f}"])
     head = ("tried", "what has to hold", "number", "lost", "seconds")
-    words = table(head, [*lines, *fuzzed(given.fuzz)])
+    words = table(head, [*lines, *fuzzed(ROOT / "build" / "fuzz")])
     say(words)
-    write(given.out / "reliability.md", words)
+    write(out / "reliability.md", words)
     return 1 if wrong else 0
 
 
-def run(row: Row, results: Path) -> tuple[int, int, float]:
+def run(tests: str, chosen: str, results: Path) -> tuple[int, int, float]:
     """How many cases of a row were tried, how many failed, and how long it took."""
     start = time.perf_counter()
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--junitxml={results}"]
-    command += [*row.tests.split(), *(("-k", row.chosen) if row.chosen else ())]
+    command += [*tests.split(), *(("-k", chosen) if chosen else ())]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     tried = lost = 0
     for case in ElementTree.parse(results).getroot().iter("testcase"):
@@ -127,9 +114,8 @@ def fuzzed(folder: Path) -> Iterator[list[object]]:
         if not done:
             continue
         cases, seconds = (sum(c[what] for c in done.values()) for what in ("cases", "seconds"))
-        what = (
-            f"changed files, `make fuzz`: {len(done)} readers {where}, {min(c['cases'] for c in done.values()):,} each"
-        )
+        least = min(c["cases"] for c in done.values())
+        what = f"changed files, `make fuzz`: {len(done)} readers {where}, {least:,} each"
         lost = sum(f.startswith(f"{name}-") for f in found for name in done)
         yield [what, "read or refused", f"{cases:,}", lost, f"{seconds:.0f}"]
 

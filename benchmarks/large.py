@@ -24,7 +24,7 @@ from gimp3d.io.ply import write_gaussians
 from .command import DATA, parser_of, say, told_in_one_line, write
 from .scenes import gimp3d, read_scene, remove_words
 from .tables import Section, markdown
-from .timing import about, machine, timed
+from .timing import Watch, about, machine
 
 SHRINK = 0.5  # of the parts' standard deviations; what is lost is spread between their centres
 
@@ -72,10 +72,10 @@ def main() -> None:
     shutil.copy(given.scene / "roi.json", given.out / "roi.json")
     words = remove_words(read_scene(given.out), given.out / "out.ply")
     words += ["--summary", str(given.out / "summary.json"), "--images", "none", "--preset", given.preset]
-    messages: list[str] = []
-    wall = timed(lambda: messages.append(gimp3d(words)))[0] / 1e3
-    if messages[0]:
-        raise BadInput(messages[0])
+    watch = Watch()
+    if message := gimp3d(words):
+        raise BadInput(message)
+    wall = watch.lap()[0] / 1e3
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu, summary = used.ru_utime + used.ru_stime, json.loads((given.out / "summary.json").read_text())
     rows = [[s["name"], f"{s['seconds']:.1f}"] for s in summary["stages"]]

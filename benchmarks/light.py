@@ -27,24 +27,23 @@ from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.srgb import linear
 
 from .ablation import RULES, switched_off
-from .command import parser_of, say, told_in_one_line, write
+from .command import ASSETS, parser_of, say, told_in_one_line, write
 from .scenes import MADE, SHADOW, Scene, filled, gimp3d, marked_words, read_scene, removal, remove_words
 from .tables import Section, markdown, sheet
-from .timing import about, machine, timed
+from .timing import Watch, about, machine
 
 SHADOWED = ("tiles_mug", "kitchen_monkey", "desk_shadow", "corner_shadow")
 CLEAR = (*MADE, "real_table")
-DEMO = Path(__file__).parents[1] / "assets" / "demo"
+DEMO = ASSETS / "demo"
 DIFFERS = 0.04  # share of white by which photos with and without the shadow differ in it
 GLOSSY = (0.1, 0.2, 0.4)  # share of light that comes back from a floor
-KEPT = 0.8  # of the views in a draw
+DRAWS, KEPT = 10, 0.8  # of each scene; of the views in a draw
 DARK = 4e-3  # of linear light, below which darkness is noise
 WAYS = {"undone": ["--shadow", "auto"], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}
 
 
 def main() -> None:
     parser = parser_of(__doc__, "light", data=True)
-    parser.add_argument("--draws", type=int, default=10)
     parser.add_argument("--skip-removals", action="store_true")
     parser.add_argument("--without", choices=RULES, metavar="RULE", help="as named in benchmarks.ablation")
     given = parser.parse_args()
@@ -68,7 +67,7 @@ def main() -> None:
         head = ("glossy floor", "found", "in the reflection dB: left, undone", "seconds")
         section("Known reflections", head, (known_reflection(strength, folder) for strength in GLOSSY))
         clear = [DEMO, *(given.data / name for name in CLEAR)]
-        rows = ([f.name, f"{sum(draw(f, k) for k in range(given.draws))} of {given.draws}"] for f in clear)
+        rows = ([f.name, f"{sum(draw(f, k) for k in range(DRAWS))} of {DRAWS}"] for f in clear)
         section("Without a shadow", ("scene", "found in draws"), rows)
     words = f"{about(machine())} Without: {given.without or 'nothing'}."
     write(given.out / "light.md", markdown("The object's light", words, sections))
@@ -123,16 +122,12 @@ def light(picture: np.ndarray) -> np.ndarray:
 
 
 def known_light(made: LitScene, folder: Path) -> list[str]:
-    views = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()]
-    results = []
-    wall, _ = timed(lambda: results.append(remove_object(made.gaussians, views, made.region, PRESETS["draft"])))
-    result, final = results[0], filled(made.gaussians, results[0])
+    views, watch = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()], Watch()
+    result = remove_object(made.gaussians, views, made.region, PRESETS["draft"])
+    (wall, _), final = watch.lap(), filled(made.gaussians, result)
     towards = [np.array(x["direction"]) for x in result.shadow["lights"]]
-    off = [
-        min([angle(lamp.direction, t) for t in towards], default=180.0)
-        for lamp in made.lamps
-        if np.isfinite(lamp.softness)
-    ]
+    lamps = [lamp.direction for lamp in made.lamps if np.isfinite(lamp.softness)]
+    off = [min([angle(lamp, t) for t in towards], default=180.0) for lamp in lamps]
     before, after, rows, covers = [], [], [], 0.0
     for view in views[::3]:
         truth, drawn = render_bytes(made.truth, view.camera), render_bytes(final, view.camera)
@@ -155,15 +150,15 @@ def known_reflection(strength: float, folder: Path) -> list[str]:
     views = [View(c, render_bytes(made.gaussians, c)) for c in made.cameras()]
     scores, pictures = [], [{"truth": render_bytes(made.truth, v.camera)} for v in views[::3]]
     for way in ("off", "auto"):
-        settings, results = replace(PRESETS["balanced"], shadow=way), []
-        wall, _ = timed(lambda s=settings, r=results: r.append(remove_object(made.gaussians, views, made.region, s)))
-        final = filled(made.gaussians, results[0])
+        watch = Watch()
+        result = remove_object(made.gaussians, views, made.region, replace(PRESETS["balanced"], shadow=way))
+        (wall, _), final = watch.lap(), filled(made.gaussians, result)
         for view, row in zip(views[::3], pictures):
             row[way] = render_bytes(final, view.camera)
         where = [reflected(made, v.camera) for v in views[::3]]
         scores.append(np.mean([psnr(row[way], row["truth"], there) for row, there in zip(pictures, where)]))
     write_png(folder / f"glossy_{strength:.2f}.png", sheet(pictures))
-    found = "yes" if results[0].reflection["found"] else "no"
+    found = "yes" if result.reflection["found"] else "no"
     return [f"{strength:.0%} comes back", found, f"{scores[0]:.1f}, {scores[1]:.1f}", f"{wall / 1e3:.1f}"]
 
 

@@ -54,14 +54,13 @@ GROUPS: dict[str, dict[str, RemovalSettings]] = {
 
 
 def main() -> None:
-    parser = parser_of(__doc__, "pareto", data=True, quick="one scene, presets without the paper's")
-    parser.add_argument("--scenes", default=",".join(MADE))
-    parser.add_argument("--groups", default=",".join(GROUPS), help="of methods")
+    parser = parser_of(
+        __doc__, "pareto", data=True, quick="one scene, presets without the paper's", scenes=",".join(MADE)
+    )
     parser.add_argument("--paper-steps", type=int, default=PRESETS["paper"].refine.steps, help="fewer: a shorter run")
     given = parser.parse_args()
-    groups = {g: GROUPS[g] for g in given.groups.split(",")}
-    if "paper" in groups:
-        groups["paper"] = {n: changed(s, [("refine.steps", given.paper_steps)]) for n, s in groups["paper"].items()}
+    paper = {n: changed(s, [("refine.steps", given.paper_steps)]) for n, s in GROUPS["paper"].items()}
+    groups = GROUPS | {"paper": paper}
     if given.quick:
         given.scenes, groups = MADE[0], {"presets": {n: GROUPS["presets"][n] for n in ("draft", "balanced")}}
     results: Row = {"machine": machine(), "rows": []}
@@ -71,11 +70,10 @@ def main() -> None:
         results["rows"] += run(scene, groups)
         words = markdown("New Gaussians: quality, time, number", about(results["machine"]), sections(results["rows"]))
         write_results(given.out, "pareto", results, words)
-    rows = results["rows"]
-    full = given.scenes == ",".join(MADE) and set(groups) == set(GROUPS)
-    draw_pareto(rows, (ASSETS if full else given.out) / "pareto.svg")
-    if {"counts", "degrees"} <= set(groups):
-        draw_parsimony(means(rows), (ASSETS if full else given.out) / "parsimony.svg")
+    folder = ASSETS if given.scenes == ",".join(MADE) else given.out
+    draw_pareto(results["rows"], folder / "pareto.svg")
+    if not given.quick:
+        draw_parsimony(means(results["rows"]), folder / "parsimony.svg")
 
 
 def run(scene: Scene, groups: Mapping[str, Mapping[str, RemovalSettings]], only_compile: bool = False) -> list[Row]:
@@ -103,14 +101,19 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
 
     reference, watch = scene.test[0], Watch()
     result = removal(scene, settings, reference, scene.truth(reference), observer=watched)
-    wall, cpu = np.array(watch.lap()) / 1e3
+    spent = seconds_of(watch)
     splats = filled(scene.gaussians, result)
     hole = next(int(v.target.sum()) for v in made["masks"].views if v.camera.id == made["reference"].camera_id)
     added = len(result.added or ())
     row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, hole)}
     row |= {"stages": {s.name: s.seconds for s in result.stages}}
-    row |= {"seconds": float(wall), "cpu seconds": float(cpu), "agreement": agreement(scene, splats, result)}
+    row |= spent | {"agreement": agreement(scene, splats, result)}
     return row | scores(scene, {c.id: render_bytes(splats, c) for c in scene.test[1:]}), made["masks"].removed
+
+
+def seconds_of(watch: Watch) -> Row:
+    wall, cpu = watch.lap()
+    return {"seconds": wall / 1e3, "cpu seconds": cpu / 1e3}
 
 
 def agreement(scene: Scene, splats: Gaussians, result: RemovalResult) -> float:
@@ -129,11 +132,11 @@ def baselines(scene: Scene, removed: np.ndarray) -> Iterator[Row]:
     """The open hole, and Telea's fill of the true mask on the photo."""
     kept, watch = scene.gaussians.take(~removed), Watch()
     fills = {c.id: telea(scene.with_object(c), scene.hides(c)) for c in scene.test[1:]}
-    spent = np.array(watch.lap()) / 1e3
+    spent = seconds_of(watch)
     opened = {c.id: render_bytes(kept, c) for c in scene.test[1:]}
-    for name, pictures, (wall, cpu) in (("hole open", opened, np.zeros(2)), ("telea", fills, spent)):
+    for name, pictures, took in (("hole open", opened, dict.fromkeys(spent, 0.0)), ("telea", fills, spent)):
         row: Row = {"group": "baselines", "scene": scene.name, "method": name, "added": 0, "share": 0.0, "stages": {}}
-        yield row | {"seconds": float(wall), "cpu seconds": float(cpu)} | scores(scene, pictures)
+        yield row | took | scores(scene, pictures)
 
 
 def means(rows: Sequence[Row]) -> list[Row]:

@@ -122,13 +122,8 @@ def noisy_surfaces(relative: float, seed: int) -> Observer:
     return observe
 
 
-def gathered(
-    cameras: Sequence[Camera],
-    middle: Camera,
-    centre: np.ndarray,  # [3] what they look at
-    degrees: float,
-) -> tuple[Camera, ...]:
-    """The middle camera, turned about `centre` towards each of the cameras: by `degrees` towards the farthest."""
+def gathered(cameras: Sequence[Camera], middle: Camera, centre: np.ndarray, degrees: float) -> tuple[Camera, ...]:
+    """The middle camera, turned about what they look at [3] towards each camera: by `degrees` towards the farthest."""
 
     def towards(camera: Camera) -> np.ndarray:
         away = camera.centre - centre
@@ -164,15 +159,14 @@ def misplaced(photos: Photos, share: float, seed: int) -> dict[str, np.ndarray]:
 def garbled(photos: Photos, share: float, seed: int) -> dict[str, np.ndarray]:
     """Squares that cover about a share of every photo show another part of it."""
     rng = np.random.default_rng(seed)
-    found = {}
-    for name, photo in photos.items():
-        rows, cols = (n // GARBLED for n in photo.shape[:2])
-        whole = photo.copy()
-        squares = whole[: rows * GARBLED, : cols * GARBLED].reshape(rows, GARBLED, cols, GARBLED, 3).swapaxes(1, 2)
+    found = {name: photo.copy() for name, photo in photos.items()}
+    for whole in found.values():
+        rows, cols = (n // GARBLED for n in whole.shape[:2])
+        tiled = whole[: rows * GARBLED, : cols * GARBLED]
+        squares = tiled.reshape(rows, GARBLED, cols, GARBLED, 3).swapaxes(1, 2)
         wrong = rng.random((rows, cols)) < share
         squares[wrong] = squares[rng.integers(rows, size=wrong.sum()), rng.integers(cols, size=wrong.sum())]
-        whole[: rows * GARBLED, : cols * GARBLED] = squares.swapaxes(1, 2).reshape(rows * GARBLED, cols * GARBLED, 3)
-        found[name] = whole
+        tiled[:] = squares.swapaxes(1, 2).reshape(tiled.shape)
     return found
 
 

@@ -30,7 +30,7 @@ STYLE = {
 
 @dataclass(frozen=True)
 class Line:
-    """Points of one thing, joined or not; lines of a group have one colour."""
+    """Points of one thing; lines of a group have one colour."""
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -46,8 +46,8 @@ class Panel:
 
     heading: str
     lines: Sequence[Line]
-    x_label: str = ""
-    y_label: str = ""
+    x_label: str
+    y_label: str
     x_log: bool = True
     y_log: bool = True
     x_ticks: Mapping[float, str] = field(default_factory=dict)  # empty: each x
@@ -60,7 +60,7 @@ def figure(path: Path, title: str, subtitle: str, width: float, height: float) -
     """A figure of so many inches, written when the block ends."""
     with mpl.rc_context(STYLE):
         fig = Figure(figsize=(width, height), layout="constrained")
-        fig.suptitle(title + (f"\n{subtitle}" if subtitle else ""), x=0.01, ha="left", fontsize=11)
+        fig.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=11)
         yield fig
         found = StringIO()
         fig.savefig(found, format="svg", metadata={"Date": None})
@@ -68,11 +68,12 @@ def figure(path: Path, title: str, subtitle: str, width: float, height: float) -
 
 
 def draw_panels(
-    path: Path, title: str, subtitle: str, grid: Sequence[Sequence[Panel]], size: tuple[float, float] = (4.2, 3.3)
+    path: Path, title: str, subtitle: str, grid: Sequence[Sequence[Panel]], size: tuple[float, float]
 ) -> None:
-    """Rows of panels, each so many inches large; one legend where lines are not named at their ends."""
-    across = max(len(row) for row in grid)
-    colours = colours_of([line for row in grid for panel in row for line in panel.lines])
+    """Rows of as many panels, each so many inches large; one legend where lines are not named at their ends."""
+    across = len(grid[0])
+    groups = dict.fromkeys(line.group or line.name for row in grid for panel in row for line in panel.lines)
+    colours = {group: COLOURS[k % len(COLOURS)] for k, group in enumerate(groups)}
     with figure(path, title, subtitle, across * size[0], len(grid) * size[1] + 0.6) as fig:
         one_scale = all(len({panel.y_label for panel in row}) == 1 for row in grid)
         axes = fig.subplots(len(grid), across, squeeze=False, sharey="row" if one_scale else False)
@@ -88,15 +89,8 @@ def draw_panels(
                     plain_log_ticks(ax.yaxis, ax.get_ylim())
                 if one_scale and ax is not places[0]:
                     ax.set_ylabel("")
-            for ax in places[len(row) :]:
-                ax.set_axis_off()
         if handles:
             fig.legend(handles.values(), handles, loc="outside lower left", ncols=8, fontsize=8.5)
-
-
-def colours_of(lines: Sequence[Line]) -> dict[str, str]:
-    """A colour for each group, in the order of their first lines."""
-    return {g: COLOURS[k % len(COLOURS)] for k, g in enumerate(dict.fromkeys(s.group or s.name for s in lines))}
 
 
 End = tuple[float, float, str, str]  # of a line: x, y, its name and colour

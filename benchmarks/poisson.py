@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -90,28 +91,22 @@ def main() -> int:
 # -------------------------------------------------------------------------------------------------------- the problem
 
 
-def make_hole(case: Case) -> np.ndarray:
+def many_parts(h: int, w: int, share: float) -> np.ndarray:
     """[H, W] bool with the share of pixels asked for."""
-    h, w = SIZES[case.size]
-    if case.shape == "parts":
-        rng = np.random.default_rng(7)
-        small = scipy.ndimage.gaussian_filter(rng.standard_normal((120, 214)), 5)
-        field = scipy.ndimage.zoom(small, (h / 120, w / 214), order=1)[:h, :w]
-        field += 0.1 * field.std() * scipy.ndimage.gaussian_filter(rng.standard_normal((h, w)), 1.5)
-        return field > np.quantile(field, 1 - case.share)
-    return blob(h, w, 7, case.share)
-
-
-def make_values(case: Case) -> np.ndarray:
-    """[H, W]: waves of all lengths and noise."""
-    h, w = SIZES[case.size]
-    y, x = np.mgrid[:h, :w] / h
-    return np.sin(7 * x + 3 * y) + 0.5 * np.cos(23 * x * y) + 0.1 * np.random.default_rng(1).standard_normal((h, w))
+    rng = np.random.default_rng(7)
+    small = scipy.ndimage.gaussian_filter(rng.standard_normal((120, 214)), 5)
+    field = scipy.ndimage.zoom(small, (h / 120, w / 214), order=1)[:h, :w]
+    field += 0.1 * field.std() * scipy.ndimage.gaussian_filter(rng.standard_normal((h, w)), 1.5)
+    return field > np.quantile(field, 1 - share)
 
 
 @cache
 def problem(case: Case) -> Problem:
-    hole, values = make_hole(case), make_values(case)
+    """Waves of all lengths and noise, with the case's hole."""
+    h, w = SIZES[case.size]
+    hole = many_parts(h, w, case.share) if case.shape == "parts" else blob(h, w, 7, case.share)
+    y, x = np.mgrid[:h, :w] / h
+    values = np.sin(7 * x + 3 * y) + 0.5 * np.cos(23 * x * y) + 0.1 * np.random.default_rng(1).standard_normal((h, w))
     weight = anchor = None
     if case.screened:
         rng = np.random.default_rng(2)
@@ -127,12 +122,10 @@ def assemble(
 ) -> tuple[scipy.sparse.csr_matrix, np.ndarray, float]:
     """Matrix, right-hand side, and the constant that it is relative to: the one that fits best."""
     rows, columns = np.nonzero(hole)
-    count = len(rows)
     index = np.full(np.add(hole.shape, 2), -1)
-    index[rows + 1, columns + 1] = np.arange(count)
+    index[rows + 1, columns + 1] = np.arange(len(rows))
     known = np.pad(np.where(hole, np.nan, values), 1, constant_values=np.nan)
-    ties, right, pairs = np.zeros(count), np.zeros(count), []
-    degree = np.zeros(count)
+    (ties, right, degree), pairs = np.zeros((3, len(rows))), []
     for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         q = rows + 1 + dy, columns + 1 + dx
         linked = np.flatnonzero(index[q] >= 0)
@@ -146,7 +139,7 @@ def assemble(
         right += (weight * anchor)[hole]
     level = right.sum() / ties.sum()
     here, there = (np.concatenate(side) for side in zip(*pairs))
-    links = scipy.sparse.csr_matrix((np.ones(len(here)), (here, there)), (count, count))
+    links = scipy.sparse.csr_matrix((np.ones(len(here)), (here, there)), (len(rows), len(rows)))
     return (scipy.sparse.diags(degree + ties) - links).tocsr(), right - level * ties, level
 
 
@@ -169,13 +162,10 @@ def pyamg_cg(given: Problem, tolerance: float) -> Solution:
 
 
 def scipy_cg(given: Problem, tolerance: float) -> Solution:
-    steps = [0]
-
-    def count(_: np.ndarray) -> None:
-        steps[0] += 1
-
-    found, _ = scipy.sparse.linalg.cg(given.matrix, given.right, rtol=tolerance, maxiter=100_000, callback=count)
-    return found, steps[0]
+    steps = count()
+    options = {"maxiter": 100_000, "callback": lambda _: next(steps)}
+    found, _ = scipy.sparse.linalg.cg(given.matrix, given.right, rtol=tolerance, **options)
+    return found, next(steps)
 
 
 def splu(given: Problem) -> Solution:
@@ -228,7 +218,7 @@ def taking_turns(runs: dict[Any, Callable[[], Solution]]) -> tuple[dict[Any, flo
 def report(results: Row) -> str:
     by_tolerance = results["by_tolerance"]
     assembly = {r["size"]: f"{r['assembly_ms']:.0f} ms at {r['size']}" for r in by_tolerance}
-    sections = [
+    sections = (
         Section(
             "Holes of 8 %, by tolerance",
             "CPU milliseconds, best of several in turns; ours from masks and values to filled pixels, the others from "
@@ -243,7 +233,7 @@ def report(results: Row) -> str:
             "their own.",
             *columns(comparison(results["by_shape"]), COMPARED),
         ),
-    ]
+    )
     words = f"One thread, {about(results['machine'])} {results['versions']}."
     return markdown("Speed of the Poisson solver", words, sections)
 

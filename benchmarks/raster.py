@@ -11,7 +11,6 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import cycle
@@ -84,8 +83,7 @@ QUICK = Plan(
 
 
 def main() -> int:
-    parser = parser_of(__doc__, "raster", quick="20k Gaussians at 480×270 only, below a minute")
-    given = parser.parse_args()
+    given = parser_of(__doc__, "raster", quick="20k Gaussians at 480×270 only, below a minute").parse_args()
     plan = QUICK if given.quick else FULL
     results: Row = {"quick": given.quick, "machine": machine()}
     in_new_process(__spec__.name, "warm_up()")  # a process that compiles needs more memory than one that does not
@@ -150,23 +148,16 @@ def picture_gradients(size: Size) -> PictureGradients:
 # ------------------------------------------------------------------------------------------------------------- timing
 
 
-@contextmanager
-def tile_phases() -> Iterator[list[tuple[float, float]]]:
-    """What the work on tiles alone costs: blending, and the way back through it."""
-    over_tiles, laps = cpu.over_tiles, []
+def draw_once(gaussians: Gaussians, view: Camera, gradients: PictureGradients) -> list[tuple[float, float]]:
+    """(wall, CPU) of forward, backward, and in them the work on tiles alone: blending and unblending."""
+    over_tiles, phases = cpu.over_tiles, []
 
     def watched(*args: Any) -> None:
         watch = Watch()
         over_tiles(*args)
-        laps.append(watch.lap())
+        phases.append(watch.lap())
 
     with replaced(cpu, "over_tiles", watched):
-        yield laps
-
-
-def draw_once(gaussians: Gaussians, view: Camera, gradients: PictureGradients) -> list[tuple[float, float]]:
-    """(wall, CPU) of forward, backward, and in them blending and unblending."""
-    with tile_phases() as phases:
         watch = Watch()
         _, traced = trace(gaussians, view, passes=PASSES)
         forward = watch.lap()

@@ -27,8 +27,8 @@ from gimp3d.io.images import read_image, read_mask, write_png
 from gimp3d.io.ply import read_ply, write_ply
 
 from .command import parser_of, say, told_in_one_line, write, write_results
-from .scenes import MADE, REAL, Scene, compile_kernels, gimp3d, read_scenes, remove_words, scene_words, shadow_words
-from .tables import Row, Section, distance_to, markdown, sheet, values, where
+from .scenes import MADE, REAL, Scene, gimp3d, read_scenes, remove_words, scene_words, shadow_words
+from .tables import Row, Section, columns, distance_to, markdown, sheet, values, where
 from .timing import about, machine
 
 SCENES = (*REAL, "kitchen_480")
@@ -65,7 +65,7 @@ class Run:
 
     @property
     def name(self) -> str:
-        return "_".join([self.preset, self.kind, *["shadow_marked"] * self.marked])
+        return f"{self.preset}_{self.kind}" + "_shadow_marked" * self.marked
 
 
 def planned(scene: Scene, presets: Sequence[str]) -> Iterator[Run]:
@@ -81,15 +81,15 @@ def planned(scene: Scene, presets: Sequence[str]) -> Iterator[Run]:
 
 
 def main() -> None:
-    parser = parser_of(__doc__, "real", data=True)
-    parser.add_argument("--scenes", default=",".join(SCENES), help="folders of DATA, or of real/ beside it")
+    parser = parser_of(__doc__, "real", data=True, scenes=",".join(SCENES))
     parser.add_argument("--presets", default=",".join(PRESETS))
     parser.add_argument("--reuse", action="store_true", help="score removals that lie in OUT instead of running them")
     given = parser.parse_args()
     results: Row = {"machine": machine(), "rows": [], "coverage": [], "pictures": []}
     scenes = read_scenes(given.data, given.scenes)
-    if not given.reuse:
-        compile_kernels(scenes[0], given.out)
+    if not given.reuse:  # compile what is timed, by a removal with a single step of refinement, refused or not
+        words = remove_words(scenes[0], given.out / "compiled.ply")
+        gimp3d([*words, "--preset", "balanced", "--set", "refine.steps=1"])
     for scene in scenes:
         bench_scene(scene, given.presets.split(","), given.out, given.reuse, results)
         write_results(given.out, "real", results, report(results))
@@ -193,11 +193,8 @@ def shown(scene: Scene) -> list[Camera]:
 # ----------------------------------------------------------------------------------------- round the object, its volume
 
 
-def ring(
-    mask: np.ndarray,  # [H, W] bool, what the object hides
-    left_out: np.ndarray,  # [H, W] bool
-) -> np.ndarray:
-    """[H, W] bool: the pixels nearest to the mask but not close to it, as many as it has, or all there are."""
+def ring(mask: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+    """[H, W] bool, as what is given: the pixels nearest to the mask but not close to it, as many as it has, or all."""
     away = distance_to(mask)
     allowed = np.flatnonzero((away > CLEARANCE) & ~left_out)
     found = np.zeros(mask.shape, bool)
@@ -228,11 +225,9 @@ def round_the_object(scene: Scene, renders: Path) -> dict[str, float]:
 
 
 def outside_hidden_volume(
-    points: np.ndarray,  # [N, 3] world
-    views: Sequence[tuple[Camera, np.ndarray]],  # with what the object hides there, [H, W] bool
-    tolerance: int = TOLERANCE,
+    points: np.ndarray, views: Sequence[tuple[Camera, np.ndarray]], tolerance: int = TOLERANCE
 ) -> np.ndarray:
-    """[N] bool: points that some view frames beside the object, or that no view frames."""
+    """[N] bool: points [N, 3] that some view frames beside what the object hides there [H, W], or that no view does."""
     framed, beside = np.zeros(len(points), bool), np.zeros(len(points), bool)
     kernel = np.ones((2 * tolerance + 1,) * 2, np.uint8)
     for camera, mask in views:
@@ -269,14 +264,12 @@ def write_sheets(scene: Scene, renders: Path, target: Path) -> list[str]:
     """A run's sheets, a row per view, whole and close up, beside the folder `target`; their names."""
     if scene.has_truth:
         rows = [with_truth(scene, c, renders) for c in scene.test]
-        masks = [scene.hides(c) for c in scene.test]
-        windows = [bounds(m, int(np.sqrt(m.sum()) / 2)) for m in masks]
+        windows = [bounds(m, int(np.sqrt(m.sum()) / 2)) for m in map(scene.hides, scene.test)]
         close = [{words: picture[window] for words, picture in row.items()} for row, window in zip(rows, windows)]
         sheets = {f"{target.name}.png": rows, f"{target.name}.close.png": close}
     else:
-        pictures = {c.id: read_image(renders / f"{output_name(c.id)}.png") for c in shown(scene)}
-        rows = [{output_name(i): scene.photos[i], "result": picture} for i, picture in pictures.items()]
-        sheets = {f"{target.name}.png": rows}
+        drawn = {c.id: read_image(renders / f"{output_name(c.id)}.png") for c in shown(scene)}
+        sheets = {f"{target.name}.png": [{output_name(i): scene.photos[i], "result": p} for i, p in drawn.items()]}
     for name, of in sheets.items():
         write_png(target.with_name(name), sheet(of))
     return list(sheets)
@@ -432,11 +425,7 @@ def sections(results: Row) -> Iterator[Section]:
             "Coverage of T",
             "Training views. Covered: share of the pixels that no view sees that T holds. Area: of T over theirs. "
             "Invented: share of the mask that is in T though some view sees it.",
-            ["scene", "shadow", "covered", "area", "invented"],
-            [
-                [c["scene"], _shadow(c), f"{c['covered']:.3f}", f"{c['area']:.2f}", f"{c['invented']:.1%}"]
-                for c in results["coverage"]
-            ],
+            *columns(({**c, "shadow": _shadow(c)} for c in results["coverage"]), OF_COVERAGE),
         )
     judged = [r for r in rows if r.get("score") is not None and "error" in r]
     if judged:
@@ -445,12 +434,14 @@ def sections(results: Row) -> Iterator[Section]:
             "Verdict against truth",
             "Error: PSNR of the ring before the removal less that of the mask, dB. Spearman's coefficient: "
             + (f"{order:.2f}." if order is not None else "nothing to be ordered."),
-            ["scene", "shadow", "method", "picture", "score", "error"],
-            [
-                [r["scene"], _shadow(r), r["method"], r["kind"], f"{r['score']:.3f}", f"{r['error']:+.2f}"]
-                for r in sorted(judged, key=lambda r: -r["score"])
-            ],
+            *columns(({**r, "shadow": _shadow(r)} for r in sorted(judged, key=lambda r: -r["score"])), OF_VERDICTS),
         )
+
+
+OF_COVERAGE = {"scene": "{scene}", "shadow": "{shadow}", "covered": "{covered:.3f}", "area": "{area:.2f}"}
+OF_COVERAGE |= {"invented": "{invented:.1%}"}
+OF_VERDICTS = {"scene": "{scene}", "shadow": "{shadow}", "method": "{method}", "picture": "{kind}"}
+OF_VERDICTS |= {"score": "{score:.3f}", "error": "{error:+.2f}"}
 
 
 def _score_cells(row: Row, width: int) -> list[str]:

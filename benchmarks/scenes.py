@@ -115,13 +115,7 @@ _mask = cache(read_mask)
 
 
 def read_scene(folder: Path, needs_truth: bool = False) -> Scene:
-    """A scene's folder.
-
-    Raises
-    ------
-    BadInput
-        If it holds no scene, or no truth where that is needed.
-    """
+    """A scene's folder; BadInput if it holds no scene, or no truth where that is needed."""
     if needs_truth and not (folder / "truth").is_dir():
         raise BadInput(f"{folder} has no truth/; give the folder of scenes with and without the object")
     if not (folder / "scene.ply").is_file():
@@ -137,11 +131,8 @@ cached_scene = cache(read_scene)
 
 def read_scenes(data: Path, names: str, needs_truth: bool = False) -> list[Scene]:
     """Scenes by their names, separated by commas: folders of `data`, or of real/ beside it."""
-    found = []
-    for name in filter(None, names.split(",")):
-        folders = (data / name, data.parent / "real" / name)
-        found.append(read_scene(next((f for f in folders if f.is_dir()), folders[0]), needs_truth))
-    return found
+    asked = [(data / name, data.parent / "real" / name) for name in filter(None, names.split(","))]
+    return [read_scene(beside if beside.is_dir() and not own.is_dir() else own, needs_truth) for own, beside in asked]
 
 
 # ------------------------------------------------------------------------------------------------------------- removals
@@ -152,10 +143,10 @@ def removal(
     settings: RemovalSettings,
     reference: Camera | None = None,
     picture: np.ndarray | None = None,
-    views: Sequence[View] | None = None,  # None: the training views
+    views: Sequence[View] | None = None,
     observer: Observer = unobserved,
 ) -> RemovalResult:
-    """A removal of the scene's object; a reference that is no training view is drawn and put beside them."""
+    """A removal of the scene's object with the training or other views; a reference that is none of them is drawn."""
     given = list(scene.views if views is None else views)
     if reference is not None and reference.id not in {v.camera.id for v in given}:
         given.append(scene.drawn(reference))
@@ -193,11 +184,8 @@ def mean_psnrs(scene: Scene, splats: Gaussians, cameras: Iterable[Camera]) -> di
 
 def side_by_side() -> ProcessPoolExecutor:
     """Processes that run removals side by side and share the cores."""
-    return ProcessPoolExecutor(AT_ONCE, get_context("spawn"), _share_threads)
-
-
-def _share_threads() -> None:
-    set_thread_count(max(1, available_cores() // AT_ONCE))
+    threads = max(1, available_cores() // AT_ONCE)
+    return ProcessPoolExecutor(AT_ONCE, get_context("spawn"), set_thread_count, (threads,))
 
 
 # ---------------------------------------------------------------------------------------------------------- the program
@@ -230,8 +218,3 @@ def marked_words(masks: Mapping[str, np.ndarray], folder: Path) -> list[str]:
 def shadow_words(scene: Scene, folder: Path) -> list[str]:
     """How a command is told of the true shadow: the only place that knows."""
     return marked_words({c.id: scene.shadow(c) for c in scene.train}, folder)
-
-
-def compile_kernels(scene: Scene, out: Path) -> None:
-    """A removal with a single step of refinement, refused or not, so that nothing that is timed compiles."""
-    gimp3d([*remove_words(scene, out / "compiled.ply"), "--preset", "balanced", "--set", "refine.steps=1"])

@@ -43,8 +43,7 @@ WRONG_PHOTOS = {"exposure": exposed, "misplaced": misplaced, "garbled": garbled}
 
 
 def main() -> None:
-    parser = parser_of(__doc__, "stability", data=True, quick="one scene and three perturbations")
-    parser.add_argument("--scenes", default=SCENES, help="names, separated by commas")
+    parser = parser_of(__doc__, "stability", data=True, quick="one scene and three perturbations", scenes=SCENES)
     parser.add_argument("--preset", default="balanced", choices=PRESETS)
     given = parser.parse_args()
     scenes = read_scenes(given.data, given.scenes.split(",")[0] if given.quick else given.scenes, needs_truth=True)
@@ -102,12 +101,9 @@ def grown(new: Gaussians | None, region: Region) -> Row:
     corners = np.concatenate([box.corners() for box in region])
     centre, diagonal = corners.mean(0), float(np.linalg.norm(np.ptp(corners, axis=0)))
     arrays = (new.means, new.log_scales, new.quats, new.opacity_logits, new.sh)
-    return {
-        "added": len(new),
-        "finite": all(bool(np.isfinite(a).all()) for a in arrays),
-        "largest": float(new.scales.max()) / diagonal,
-        "farthest": float(np.linalg.norm(new.means - centre, axis=1).max()) / diagonal,
-    }
+    row = {"added": len(new), "finite": all(bool(np.isfinite(a).all()) for a in arrays)}
+    farthest = float(np.linalg.norm(new.means - centre, axis=1).max())
+    return row | {"largest": float(new.scales.max()) / diagonal, "farthest": farthest / diagonal}
 
 
 def label(kind: str, level: float) -> str:
@@ -140,11 +136,8 @@ def draw(results: Row, path: Path) -> None:
     """A column per perturbation, a row per measure, a line per scene; dashed: the hole left open."""
     rows = [r for r in results["rows"] if "refused" not in r]
     grid = []
-    for measure, words in {
-        "mask": "PSNR hidden, dB",
-        "unseen": "PSNR unseen, dB",
-        "largest": "largest splat, %",
-    }.items():
+    measures = {"mask": "PSNR hidden, dB", "unseen": "PSNR unseen, dB", "largest": "largest splat, %"}
+    for measure, words in measures.items():
         grid.append([])
         for kind in (k for k in KINDS if where(results["rows"], kind=k)):
             levels = values(where(results["rows"], kind=kind), "level")

@@ -70,7 +70,7 @@ def perturbations(quick: bool) -> Iterator[Perturbation]:
 
 def main() -> None:
     parser = parser_of(__doc__, "surface", data=True, quick="one place and the largest perturbations only")
-    parser.add_argument("--scenes", help="names, separated by commas; default: all in DATA")
+    parser.add_argument("--scenes", help="folders of DATA, separated by commas; default: all")
     given = parser.parse_args()
     names = given.scenes.split(",") if given.scenes else sorted(p.parent.name for p in given.data.glob("*/truth"))
     names = [n for n in names if given.scenes or not given.quick or n in QUICK_SCENES]
@@ -82,10 +82,8 @@ def main() -> None:
     for scene in read_scenes(given.data, ",".join(names), needs_truth=True):
         unperturbed[scene.name] = measure_scene(scene, given.quick, results, given.out)
     results["shadows"] = [shadow(n, results, unperturbed) for n in names if n + SHADOW in names]
-    words = (
-        f"{about(results['machine'])} Pictures: green is never seen and in T, magenta never seen and missed, orange "
-    )
-    words += "in T though some view sees it; outline: what the object hides."
+    words = f"{about(results['machine'])} Pictures: green is never seen and in T, magenta never seen and missed, "
+    words += "orange in T though some view sees it; outline: what the object hides."
     text = markdown("Where a removal fills, and on what surface", words, sections(results), results["pictures"])
     write_results(given.out, "surface", results, text)
     draw(results, given.out if given.quick or given.scenes else ASSETS)
@@ -197,13 +195,9 @@ def mask_scores(scene: Scene, masks: Masks) -> Row:
     there = [v for v in masks.views if v.camera.id in found]
     silhouettes = ({v.camera.id: v.silhouette for v in there}, {v.camera.id: scene.hides(v.camera) for v in there})
     pixels = int(sum(t.sum() for t in found.values()))
-    return {
-        "covered": covered,
-        "worst_view_covered": worst,
-        "area": pixels / max(1, sum(u.sum() for u in unseen.values())),
-        "silhouette_iou": overlap(*silhouettes)[0],
-        "hole_pixels": pixels,
-    }
+    area = pixels / max(1, sum(u.sum() for u in unseen.values()))
+    row = {"covered": covered, "worst_view_covered": worst, "area": area, "silhouette_iou": overlap(*silhouettes)[0]}
+    return row | {"hole_pixels": pixels}
 
 
 def completed(view: ViewMasks, views: Sequence[ViewMasks]) -> DepthCompletion:
@@ -217,16 +211,10 @@ def surface(view: ViewMasks, completion: DepthCompletion) -> np.ndarray:
     return np.where(view.target, completion.depth, view.depth_after).astype(np.float32)
 
 
-def depth_errors(scene: Scene, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """[H, W] |z − truth| / truth, infinitely far is an error of 1."""
-    truth = scene.depth(camera)
-    return np.minimum(np.abs(depth - truth) / truth, 1.0)
-
-
 def surface_scores(scene: Scene, masks: Masks) -> list[Row]:
     """Every test view as the reference: its T against the truth, and its completed surface. Refusals say why.
 
-    Errors of z count where no view sees the surface, also where T missed it; nothing there is an error of 1.
+    Errors of z count where no view sees the surface, also where T missed it; infinitely far is an error of 1.
     """
     views = {v.camera.id: v for v in masks.views}
     rows = []
@@ -236,7 +224,7 @@ def surface_scores(scene: Scene, masks: Masks) -> list[Row]:
         if camera.id not in views:
             row["refused"] = "the view does not frame the region"
             continue
-        view, unseen = views[camera.id], scene.unseen(camera)
+        view, unseen, truth = views[camera.id], scene.unseen(camera), scene.depth(camera)
         row["covered"] = shares([(view.target, without_rim(unseen))])[0]
         row["area"] = float(view.target.sum() / max(1, unseen.sum()))
         try:
@@ -244,7 +232,7 @@ def surface_scores(scene: Scene, masks: Masks) -> list[Row]:
         except IllPosed as error:
             row["refused"] = str(error)
             continue
-        error = depth_errors(scene, camera, surface(view, completion))[without_rim(unseen)]
+        error = np.minimum(np.abs(surface(view, completion) - truth) / truth, 1.0)[without_rim(unseen)]
         row |= {"median": float(np.median(error)), "p95": float(np.percentile(error, 95))}
         row |= {"confidence": completion.confidence, "reason": completion.reason}
     return rows
@@ -302,14 +290,7 @@ def sections(results: Row) -> Iterator[Section]:
         yield Section(
             "Shadows and reflections of the object in the photos",
             "The same places with splats trained on photos that show them, against without.",
-            ["place", "overlap", "covered", "area", "depth error"],
-            [
-                [
-                    *(r["scene"], f"{r['iou'][1]:.3f} (worst view {r['worst_iou'][1]:.3f})"),
-                    *(" → ".join(FORMS[k].format(x) for x in r[k]) for k in ("covered", "area", "median")),
-                ]
-                for r in results["shadows"]
-            ],
+            *columns(results["shadows"], OF_SHADOWS),
         )
 
 
@@ -319,6 +300,9 @@ OF_MASKS |= {"area": "{area:.2f}", "silhouette": "{silhouette_iou:.3f}", "hole p
 OF_MASKS |= {"CPU s": "{cpu_s:.1f}"}
 OF_DEPTHS = {"scene": "{scene}", "view": "{of}", "covered": "{covered:.2%}", "area": "{area:.2f}"}
 OF_DEPTHS |= {"median": "{median:.2%}", "95 %": "{p95:.2%}", "what happened": "{said}"}
+OF_SHADOWS = {"place": "{scene}", "overlap": "{iou[1]:.3f} (worst view {worst_iou[1]:.3f})"}
+OF_SHADOWS |= {"covered": "{covered[0]:.2%} → {covered[1]:.2%}", "area": "{area[0]:.2f} → {area[1]:.2f}"}
+OF_SHADOWS |= {"depth error": "{median[0]:.2%} → {median[1]:.2%}"}
 
 
 def stability_rows(rows: list[Row]) -> Iterator[list[str]]:
@@ -344,6 +328,7 @@ MEASURES = {  # words, whether logarithmic, unit, what is wanted
     "area": ("area of T ÷ never-seen", True, 1.0, 1.6),
     "median": ("depth error, %", True, 100.0, None),
 }
+CHANGED = ("iou", "covered", "median")  # what perturbations change
 Lines = dict[str, list[tuple[float, Row]]]  # name → places on the x axis with their rows
 
 
@@ -369,9 +354,8 @@ def draw(results: Row, folder: Path) -> None:
     draw_panels(folder / "surface_masks.svg", "Where is filled: target regions T by mode", words, [row], (6.0, 3.0))
 
     views = values(depths, "view")
-    by_scene: Lines = {
-        s: [(views.index(r["view"]), r) for r in where(depths, scene=s) if "median" in r] for s in scenes
-    }
+    done = [r for r in depths if "median" in r]
+    by_scene: Lines = {s: [(views.index(r["view"]), r) for r in where(done, scene=s)] for s in scenes}
     labels = [output_name(v).rpartition("/")[2] for v in views]
     words = "Test views, never a photo. Depth error: relative, median over never-seen pixels"
     row = [panel("", k, labels, by_scene, False) for k in ("covered", "area", "median")]
@@ -379,13 +363,10 @@ def draw(results: Row, folder: Path) -> None:
 
     columns = [(KINDS[kind][0], *perturbed(results, kind), kind != "place") for kind in KINDS]
     if results["shadows"]:
-        found = {
-            r["scene"]: [(k, {m: r[m][k] for m in ("iou", "covered", "median")}) for k in (0, 1)]
-            for r in results["shadows"]
-        }
+        found = {r["scene"]: [(k, {m: r[m][k] for m in CHANGED}) for k in (0, 1)] for r in results["shadows"]}
         columns.append(("Shadows in photos", ["without", "with"], found, True))
     words = "Mean over seeds; depth error: relative, in never-seen pixels, mean of the test views' medians"
-    grid = [[panel(c[0] if k == "iou" else "", k, *c[1:]) for c in columns] for k in ("iou", "covered", "median")]
+    grid = [[panel(c[0] if k == "iou" else "", k, *c[1:]) for c in columns] for k in CHANGED]
     title = "Stability: what wrong poses, depths and regions change"
     draw_panels(folder / "surface_stability.svg", title, words, grid, (2.8, 2.3))
 
@@ -400,8 +381,7 @@ def perturbed(results: Row, kind: str) -> tuple[list[str], Lines]:
     for scene in results["scenes"]:
         rows = [r for r in where(results["stability"], scene=scene) if "refused" not in r]
         same = [where(rows, kind="none") if label == zero else where(rows, kind=kind, label=label) for label in labels]
-        keys = ("iou", "covered", "median")
-        lines[scene] = [(k, {key: mean(of, key) for key in keys}) for k, of in enumerate(same) if of]
+        lines[scene] = [(k, {key: mean(of, key) for key in CHANGED}) for k, of in enumerate(same) if of]
     return labels, lines
 
 

@@ -22,12 +22,10 @@ NOTHING = 1e-6  # accumulated weight that counts as none
 X, Y, XX, XY, YY, OPACITY, BLENDED = range(7)
 
 
-def draw(
-    parameters: Sequence[Tensor],  # means [N, 3], log scales [N, 3], quaternions [N, 4] wxyz, opacity logits [N], sh
-    camera: Camera,
-    settings: RasterSettings = RasterSettings(),
-) -> tuple[Tensor, Tensor, Tensor]:
-    """rgb [H, W, 3] on black, alpha [H, W] and expected depth [H, W]; sh is [N, 16, 3]."""
+def draw(parameters: Sequence[Tensor], camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """rgb [H, W, 3] on black, alpha [H, W] and expected depth [H, W] of means [N, 3], log scales [N, 3], quaternions
+    [N, 4] wxyz, opacity logits [N] and SH coefficients [N, 16, 3]."""
+    settings = RasterSettings()
     features, reach = project(parameters, camera, settings)
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     entries, counts = tile_entries(features.detach(), reach, across, down, settings)
