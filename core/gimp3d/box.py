@@ -27,10 +27,19 @@ class Box:
 
     @classmethod
     def make(cls, center: object, size: object, rotation_wxyz: object = (1, 0, 0, 0)) -> Box:
-        """A checked box from anything array-like: three numbers each, in scene units, for its center and the length of
-        its edges, and a quaternion of any length but zero for how it is turned.
+        """A checked box from anything array-like.
 
-        If a number is missing or not finite, a size not positive or the quaternion zero, that is a BadInput.
+        Parameters
+        ----------
+        center, size
+            Three numbers each, in scene units; the size is the length of the edges.
+        rotation_wxyz
+            A quaternion of any length but zero: how the box is turned.
+
+        Raises
+        ------
+        BadInput
+            If a number is missing, not finite, a size is not positive or the quaternion is zero.
 
         Examples
         --------
@@ -79,10 +88,12 @@ def in_region(region: Sequence[Box], points: np.ndarray) -> np.ndarray:
 
 
 def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.ndarray) -> Box:
-    """The box that a transform [4, 4] makes of bounds [3] along a shape's own axes: any rotation, scale (also
-    negative), translation.
+    """The box that a transform makes of axis-aligned bounds; any rotation, scale (also negative), translation.
 
-    If it shears (rotated child of a non-uniformly scaled parent) or flattens the box, that is a BadInput.
+    Raises
+    ------
+    BadInput
+        If the transform shears (rotated child of a non-uniformly scaled parent) or flattens the box.
     """
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
@@ -98,7 +109,13 @@ def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.n
 
 
 def read_region(path: Path | str) -> Region:
-    """Read a ROI JSON: one box, or a list of boxes. A missing or malformed file or box is a BadInput."""
+    """Read a ROI JSON: one box, or a list of boxes.
+
+    Raises
+    ------
+    BadInput
+        If the file is missing, is not JSON, or a box is malformed.
+    """
     path = Path(path)
     data = read_json(path, "ROI", LARGEST_ROI)
     boxes = data if isinstance(data, list) else [data]

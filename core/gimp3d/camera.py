@@ -27,8 +27,13 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Camera:
-    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies. A size that is negative
-    or a number that is not finite is a ValueError."""
+    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies.
+
+    Raises
+    ------
+    ValueError
+        If the picture has no pixels, or a number is not finite.
+    """
 
     id: str  # file_path / image name / img_name, as the camera file gives it
     width: int  # pixels

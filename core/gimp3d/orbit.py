@@ -31,8 +31,17 @@ def orbit_cameras(
 ) -> tuple[Camera, ...]:
     """Cameras that look at a region's centre from rings above it, IDs orbit/000, orbit/001 …
 
-    The rings stand round `up`, a direction in the scene of any length; width and height are in pixels. A BadInput if it
-    is zero, the region is empty, or a count, size or angle makes no sense.
+    Parameters
+    ----------
+    up
+        A direction in the scene, of any length; the rings stand round it.
+    width, height
+        Of the pictures, pixels.
+
+    Raises
+    ------
+    BadInput
+        If the up direction is zero, the region is empty, or a count, size or angle makes no sense.
 
     Examples
     --------

@@ -28,11 +28,21 @@ def render(
 ) -> Rendering:
     """Draw a scene (paper, equations 1 and 2).
 
-    Of rgb, alpha, depth (both depths), expected_depth, normal and distortion only the passes asked for are computed,
-    other pictures are empty: rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene
-    units (0: nothing), normals [H, W, 3] in the camera's frame, all float32. Where `pixels` [H, W] bool are given, here
-    and below, only the 4×4 blocks round these are drawn, the rest is 0.
-    A pass that is unknown, or a mask that has not the picture's shape, is a ValueError.
+    Parameters
+    ----------
+    passes
+        Any of rgb, alpha, depth (both depths), expected_depth, normal and distortion; only these are computed.
+
+    Returns
+    -------
+    Rendering
+        rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene units (0: nothing),
+        normals [H, W, 3] in the camera's frame; all float32, None where not asked for.
+
+    Raises
+    ------
+    ValueError
+        If a pass is unknown, or the mask has not the picture's shape.
 
     Examples
     --------
@@ -59,6 +69,11 @@ def trace(
 ) -> tuple[Rendering, Trace]:
     """As `render`, and what `backward` needs. The Gaussians' arrays must not change until then.
 
+    Raises
+    ------
+    ValueError
+        If a pass is unknown.
+
     Examples
     --------
     >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
@@ -72,8 +87,15 @@ def trace(
 def backward(traced: Trace, gradients: PictureGradients) -> Gradients:
     """The gradient of a loss with respect to the traced Gaussians, given that with respect to their pictures.
 
-    It is that of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32. A given one that
-    has not its picture's shape, or whose picture was not rendered, is a ValueError.
+    Returns
+    -------
+    Gradients
+        Of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32.
+
+    Raises
+    ------
+    ValueError
+        If a gradient has not its picture's shape, or the picture was not rendered.
 
     Examples
     --------
@@ -97,7 +119,12 @@ def pixel_region(
 
     In every tile, what lies before the nearest and behind the farthest of the others is blended only when they leave
     the depths they were at. That is not done with the pass `depth` (the median needs every Gaussian); ask for
-    `expected_depth` alone where speed counts. A region is not for two threads at once. Errors are those of `render`.
+    `expected_depth` alone where speed counts. A region is not for two threads at once.
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape, or a pass is unknown.
 
     Examples
     --------
@@ -121,7 +148,12 @@ def drawing(
     """A view that is to be drawn in more than one way: the Gaussians are projected and sorted once.
 
     Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
-    while a drawing is in use, and it is not for two threads at once. A mask of the wrong shape is a ValueError.
+    while a drawing is in use, and it is not for two threads at once.
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
 
     Examples
     --------
@@ -141,9 +173,12 @@ def footprint(
     settings: RasterSettings = RasterSettings(),
     pixels: Mask = None,
 ) -> np.ndarray:
-    """Accumulated blend weight of the `chosen` Gaussians [N] bool, [H, W] float32 in 0 … 1; others may hide them.
+    """Accumulated blend weight of the chosen Gaussians, [H, W] float32 in 0 … 1; others may hide them.
 
-    If `chosen` or the mask has the wrong shape, that is a ValueError.
+    Raises
+    ------
+    ValueError
+        If `chosen` or the mask has the wrong shape.
 
     Examples
     --------
@@ -161,8 +196,18 @@ def surface_depth(
     """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
-    splats (Yu 2024; Zhang 2024). Both are [H, W] float32; depth is in scene units, 0 where alpha < 0.5. A mask of the
-    wrong shape is a ValueError.
+    splats (Yu 2024; Zhang 2024).
+
+    Returns
+    -------
+    depth : ndarray, [H, W] float32
+        Scene units; 0 where alpha < 0.5.
+    alpha : ndarray, [H, W] float32
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
 
     Examples
     --------
@@ -176,9 +221,17 @@ def surface_depth(
 def contributions(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings = RasterSettings(), pixels: Mask = None
 ) -> Contributions:
-    """Sum and maximum of every Gaussian's blend weights over a view's pixels, or only those given ([H, W] bool).
+    """Sum and maximum of every Gaussian's blend weights over the pixels of a view.
 
-    A mask of the wrong shape is a ValueError.
+    Returns
+    -------
+    Contributions
+        total [N] float32, the sum, and peak [N] float32, the maximum.
+
+    Raises
+    ------
+    ValueError
+        If the mask has not the picture's shape.
 
     Examples
     --------

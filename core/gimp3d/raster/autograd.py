@@ -41,9 +41,18 @@ def rasterize(
 ) -> Pictures:
     """Draw Gaussians so that a loss on the pictures flows back to them.
 
-    The first five are raw values as in `Gaussians`, contiguous float32 tensors on the CPU, or else a ValueError (they
-    would have to be copied). They must not be changed in place between forward and backward: torch checks that. `view`
-    is a camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
+    Parameters
+    ----------
+    means, log_scales, quats, opacity_logits, sh
+        Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
+        forward and backward: torch checks that.
+    view
+        A camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
+
+    Raises
+    ------
+    ValueError
+        If a tensor is of another type, on another device or not contiguous (it would have to be copied).
     """
     tensors = (means, log_scales, quats, opacity_logits, sh)
     for name, t in zip(ARRAYS, tensors):

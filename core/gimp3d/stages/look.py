@@ -81,7 +81,10 @@ def look(
 ) -> ViewBefore:
     """A view with the object.
 
-    Raises BadInput if the photo or the extra mask has not the view's size.
+    Raises
+    ------
+    BadInput
+        If the photo or the extra mask has not the view's size.
     """
     for kind, picture in (("photo", photo), ("extra mask", extra)):
         if picture is not None and picture.shape[:2] != (camera.height, camera.width):

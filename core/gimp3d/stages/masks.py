@@ -130,8 +130,12 @@ def find_masks(
     Every view is drawn a fixed number of times. What appears behind the object is judged as points of space, by all
     views together, so that all targets agree.
 
-    Raises BadInput if the mode is unknown, or a photo or an extra mask has not its view's size; IllPosed if every
-    Gaussian is selected, or no camera sees the region from outside.
+    Raises
+    ------
+    BadInput
+        If the mode is unknown, or a photo or an extra mask has not its view's size.
+    IllPosed
+        If every Gaussian is selected, or no camera sees the region from outside.
     """
     if settings.mode not in ("need", "paper"):
         raise BadInput(f"masks: unknown mode {settings.mode!r}; use need or paper")

@@ -107,7 +107,10 @@ def choose_reference(
     Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
     the best view of it: 1 is a view that shows everything as well as any does.
 
-    Raises IllPosed if the wanted view does not see the hole, or no view does.
+    Raises
+    ------
+    IllPosed
+        If the wanted view does not see the hole, or no view does.
     """
     surface = needed_surface(views)
     seen = parallel_map(lambda v: _seen(v, *surface) if v.target.any() else None, views, most=2)

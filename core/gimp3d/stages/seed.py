@@ -61,7 +61,10 @@ def seed_gaussians(
     The target is cut into rectangles (see `_patches`). Each becomes one Gaussian in the surface's tangent plane whose
     picture in the reference has the rectangle's shape, so that neighbours meet without cracks at any slant.
 
-    Raises BadInput if `settings.largest` is no power of two.
+    Raises
+    ------
+    BadInput
+        If `settings.largest` is no power of two.
     """
     if settings.largest < 1 or settings.largest & (settings.largest - 1):
         raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")

@@ -54,7 +54,10 @@ def propagate(
 
     As many views are in memory as threads work on them; what is kept of each is the part round its hole.
 
-    Raises BadInput if the transfer or the blend is unknown.
+    Raises
+    ------
+    BadInput
+        If the transfer or the blend is unknown.
     """
     for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
         if value not in known:
