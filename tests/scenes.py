@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, lay_planes
+from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.witness import Witness
 
 BLOCK = 0.5  # side of the block, scene units
 REGION = (Box.make([0, 0, 0.26], [0.62, 0.62, 0.56]),)  # cuts 2 cm into the floor, as users' boxes do
@@ -76,3 +81,14 @@ def truth() -> Gaussians:
 def cameras(count: int = 9, width: int = 120, height: int = 90) -> tuple[Camera, ...]:
     """Views from rings round the block."""
     return orbit_cameras(REGION, count, (0, 0, 1), width, height, 50)
+
+
+def charts_of(
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    settings: ChartSettings = ChartSettings(),
+    marked: Sequence[np.ndarray] = (),
+) -> tuple[Chart, ...]:
+    """What photos show at planes round the block."""
+    return draw_charts(lay_planes(planes, views, witnesses, REGION, settings), witnesses, REGION, marked)

@@ -48,6 +48,7 @@ def look_behind(
     if settings.charts is None or masks.mode != "need":
         return Behind(scene, masks, views, (), lit)
     surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
+    masks = replace(masks, selection=surfaces.selection)
 
     def in_light(found: Found | None, suffix: str = "") -> tuple[Relit, Charted]:
         """What the object does to the light undone, and the charts as they are then."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..box import Region
 from ..compute.threads import parallel_map
-from ..gaussians import SH_C0, Gaussians
+from ..gaussians import Gaussians
 from ..geometry import dilated, framed, sees, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
-from .charts import Chart, Hits, extent, first_hits
+from .charts import Chart, Hits, LaidPlane, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
 from .witness import Witness, total_over
@@ -25,7 +25,6 @@ RIM = 1  # px by which the object is larger in the photo than in the splats
 SPECK = 3  # px; smaller spots are splats of the floor that went along
 HAZE_WEIGHT = 0.5  # px of blend weight, over all views, below which a Gaussian draws nothing
 LEAST_SEEN = 0.5  # px of blend weight in a photo, below which it shows nothing of a Gaussian
-LIKE = 30.0  # grey levels within which a Gaussian's colour is that of the surface it lies on
 LOW = 0.1  # diagonals of the region above the surface up to which a rest of the object may stand
 REACH = 24  # px round the removed Gaussians in which the scene is drawn anew: their dilated surroundings
 TOUCHED = 0.05  # blend weight of the removed Gaussians from which a pixel changes
@@ -83,21 +82,45 @@ def vouching(
     return np.where(rows, photos, 0), np.where(rows, hidden, 0)
 
 
-def _surface_rows(scene: Gaussians, selection: Selection, charts: Sequence[Chart]) -> np.ndarray:
-    """Rows taken for the object, though they lie on a chart and look like it, where photos show it.
-
-    Selection follows planes; only charts know uneven surface. They lie on it within what views' surfaces do.
-    """
+def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[LaidPlane]) -> np.ndarray:
+    """[M] rows taken for the object that do not stand before a surface: splats of floors mostly lie a little below."""
     rows = np.flatnonzero(np.isin(selection.fates, (Fate.REMOVED_INSIDE, Fate.REMOVED_STRADDLING)))
-    colours = 255 * np.clip(0.5 + SH_C0 * scene.sh[rows, 0], 0, 1)
-    back = np.zeros(len(rows), bool)
+    sunk = np.zeros(len(rows), bool)
+    for one in laid:
+        index, *at, z = framed(one.camera, scene.means[rows].astype(np.float64))
+        sunk[index] |= z > one.surface.depth[tuple(at)]
+    return rows[sunk]
+
+
+def told_by_charts(
+    scene: Gaussians,
+    region: Region,
+    selection: Selection,
+    sunk: np.ndarray,  # [M] rows, see sunk_rows
+    charts: Sequence[Chart],  # drawn as if these hid nothing
+) -> Selection:
+    """The object, as photos of surfaces tell it: what they show of a surface is the surface, and no box cuts it out.
+
+    Of sunk splats those stay on whose place photos show the surface; where they show the object instead, what the box
+    left of it goes.
+    """
+    fates = selection.fates.copy()
     for chart in charts:
-        index, *at, z = framed(chart.camera, scene.means[rows].astype(np.float64))
-        texels = tuple(at)
-        shown = (chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below)[texels]
-        unlike = np.abs(colours[index] - chart.image[texels]).max(-1)
-        back[index] |= shown & (np.abs(z - chart.depth[texels]) < chart.noise) & (unlike < LIKE)
-    return rows[back]
+        index, *at, _ = framed(chart.camera, scene.means[sunk].astype(np.float64))
+        shown = chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below
+        fates[sunk[index[shown[tuple(at)]]]] = Fate.KEPT_SURFACE
+    fates[_rests(scene, region, ~selection.removed & near_region(scene, region, 1.0), charts)] = Fate.REMOVED_REVEALED
+    return Selection(fates)
+
+
+def _rests(scene: Gaussians, region: Region, rows: np.ndarray, charts: Sequence[Chart]) -> np.ndarray:
+    """Those of the rows [N] bool, as indices, that lie low where charts show rests of the object."""
+    among = np.flatnonzero(rows & scene.usable)
+    means, found = scene.means[among].astype(np.float64), np.zeros(len(among), bool)
+    for chart in charts:
+        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
+        found |= rest & (np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region))
+    return among[found]
 
 
 def clear_air(
@@ -109,21 +132,16 @@ def clear_air(
     charts: Sequence[Chart],
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
-    """Remove what only the removal reveals and no photo shows, and rests of the object; give back what is surface."""
+    """Remove what only the removal reveals and no photo shows, and rests of the object."""
     stays = ~selection.removed
     kept = scene.take(stays)
-    near = near_region(scene, region, 1.0)[stays]
+    around = near_region(scene, region, 1.0) & stays
+    near = around[stays]
     photos, hidden = vouching(kept, near, views, witnesses, settings.observed)
     fates = selection.fates.copy()
     haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
     fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
-    fates[_surface_rows(scene, selection, charts)] = Fate.KEPT_SURFACE
-    rows = np.flatnonzero(stays)[near & kept.usable]
-    means = scene.means[rows].astype(np.float64)
-    for chart in charts:
-        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
-        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
+    fates[_rests(scene, region, around, charts)] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 

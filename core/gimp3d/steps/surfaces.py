@@ -10,8 +10,8 @@ import numpy as np
 from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
-from ..stages.charts import Chart, Plane, draw_charts, find_planes
-from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels
+from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
+from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, told_by_charts
 from ..stages.masks import Masks
 from ..stages.selection import Selection
 from ..stages.witness import Witness
@@ -23,6 +23,8 @@ class Surfaces:
     """What is round the object, and where photos show it; tuples are of the masks' views."""
 
     planes: tuple[Plane, ...]
+    laid: tuple[LaidPlane, ...]  # those of which the object hides something
+    selection: Selection  # without what photos show to be surface, with rests of the object that they show
     objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
@@ -46,9 +48,27 @@ def find_surfaces(
     # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
     objects = tuple(object_pixels(scene, masks.removed, masks.views, settings.clearing))
-    found = Surfaces((), objects, marked, 1.0, "")
-    planes = find_planes(masks.views, found.witnesses(views), region, settings.charts)
-    return replace(found, planes=planes, reason=f"{len(planes)} planes run into what the object hid")
+    rough = Surfaces((), (), masks.selection, objects, marked, 1.0, "")
+    witnesses = rough.witnesses(views)
+    planes = find_planes(masks.views, witnesses, region, settings.charts)
+    laid = lay_planes(planes, masks.views, witnesses, region, settings.charts)
+    reason = f"{len(planes)} planes run into what the object hid"
+    found = replace(rough, planes=planes, laid=laid, reason=reason)
+    sunk = sunk_rows(scene, masks.selection, laid)
+    if not len(sunk):
+        return found
+
+    def hidden_by(removed: np.ndarray) -> Surfaces:
+        return replace(found, objects=tuple(object_pixels(scene, removed, masks.views, settings.clearing)))
+
+    standing = masks.removed
+    standing[sunk] = False
+    charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
+    selection = told_by_charts(scene, region, masks.selection, sunk, charts)
+    given = int((masks.removed & ~selection.removed).sum())
+    return replace(
+        hidden_by(selection.removed), selection=selection, reason=f"{reason}, {given} Gaussians of theirs stay"
+    )
 
 
 @dataclass(frozen=True)
@@ -73,7 +93,7 @@ def chart_surfaces(
     """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
     assert settings.charts is not None
     witnesses, marked = surfaces.witnesses(views), surfaces.marked
-    charts = draw_charts(surfaces.planes, masks.views, witnesses, region, settings.charts, marked)
+    charts = draw_charts(surfaces.laid, witnesses, region, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
     tolerance = max(c.tolerance for c in charts)

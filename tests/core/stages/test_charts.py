@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
-from scenes import REGION, cameras
+from scenes import REGION, cameras, charts_of
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
-from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, extent, find, find_planes, first_hits
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
@@ -142,7 +142,7 @@ def floor_room() -> Room:
 
 @pytest.fixture(scope="module")
 def floor_chart(floor_room: Room) -> Chart:
-    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, floor_room.witnesses, REGION)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, floor_room.witnesses)
     return chart
 
 
@@ -152,7 +152,7 @@ def test_a_plane_is_found_where_photos_have_it_though_depths_are_noisy(noisy: Ro
     assert np.degrees(np.arccos(plane.normal @ normal)) < 0.3
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
     assert np.abs(plane.points(x, y) @ normal - offset).max() < 0.003
-    (chart,) = draw_charts([plane], noisy.views, noisy.witnesses, REGION)
+    (chart,) = charts_of([plane], noisy.views, noisy.witnesses)
     assert chart.kind == "plane"
 
 
@@ -258,7 +258,7 @@ def test_a_chart_shows_the_floor_and_nothing_in_its_hole(floor_room: Room, floor
 
 def test_a_surface_that_nothing_hides_has_no_chart(floor_room: Room) -> None:
     clear = [replace(w, hidden=np.zeros_like(w.hidden)) for w in floor_room.witnesses]
-    assert draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, clear, REGION) == ()
+    assert charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, clear) == ()
 
 
 def area(chart: Chart, mask: np.ndarray) -> float:
@@ -279,7 +279,7 @@ def wide(floor_room: Room) -> list[Witness]:
 
 @pytest.fixture(scope="module")
 def wide_chart(floor_room: Room, wide: list[Witness]) -> Chart:
-    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, wide, REGION)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, wide)
     return chart
 
 
@@ -305,7 +305,7 @@ def test_what_photos_disagree_on_below_the_mask_stays_hole(
         replace(w, photo=np.where((w.hidden & ~narrow.hidden)[..., None], w.photo[::-1], w.photo))
         for w, narrow in zip(wide, floor_room.witnesses)
     ]
-    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, other, REGION)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, other)
     assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
 
 
@@ -315,7 +315,7 @@ def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
     left = np.arange(240) < 120
     marks = [w.hidden & left & (k == 0) for k, w in enumerate(wide)]  # in one view
     plane = Plane.make(np.zeros(3), UP, REGION)
-    (chart,) = draw_charts([plane], floor_room.views, wide, REGION, ChartSettings(), marks)
+    (chart,) = charts_of([plane], floor_room.views, wide, ChartSettings(), marks)
     on = sees(EYES[0], marks[0], texels(chart), np.inf).reshape(chart.hole.shape)
     assert (wide_chart.below & on).sum() > 500 and chart.hole[wide_chart.below & on].all()
     apart = cv2.dilate(on.astype(np.uint8), np.ones((17, 17))) == 0
@@ -325,7 +325,7 @@ def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
 
 def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:
     plane = Plane.make(np.zeros(3), UP, REGION)
-    small = draw_charts([plane], floor_room.views, floor_room.witnesses, REGION, ChartSettings(largest=50))[0]
+    small = charts_of([plane], floor_room.views, floor_room.witnesses, ChartSettings(largest=50))[0]
     assert max(small.camera.width, small.camera.height) in (50, 51)
     assert area(small, small.hole) == pytest.approx(area(floor_chart, floor_chart.hole), rel=0.05)
 
@@ -343,8 +343,8 @@ def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: t
     eyes = front_cameras(heights)
     seen = room(eyes, [FLOOR, WALL])
     planes = [Plane.make(np.zeros(3), UP, REGION), Plane.make(np.array([0, 0.4, 0]), WALL[0], REGION)]
-    chart = draw_charts(planes, seen.views, seen.witnesses, REGION)[which]
-    (alone,) = draw_charts(planes[which : which + 1], seen.views, seen.witnesses, REGION)
+    chart = charts_of(planes, seen.views, seen.witnesses)[which]
+    (alone,) = charts_of(planes[which : which + 1], seen.views, seen.witnesses)
     points, there, hole = texels(chart), chart.there.ravel(), chart.hole.ravel()
     behind = (points[:, 1] - 0.4, -points[:, 2])[which]  # how far behind the other surface
     assert alone.there.ravel()[behind > 0.01].any()  # the other chart, not the photos, ends this one
@@ -357,7 +357,7 @@ def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: t
 
 def test_parallel_surfaces_do_not_end_each_other(floor_room: Room, floor_chart: Chart) -> None:
     planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, 0.005)]
-    first = draw_charts(planes, floor_room.views, floor_room.witnesses, REGION)[0]
+    first = charts_of(planes, floor_room.views, floor_room.witnesses)[0]
     np.testing.assert_array_equal(first.there, floor_chart.there)
 
 
@@ -478,7 +478,7 @@ def test_what_a_single_photo_shows_through_the_object_is_no_island_in_the_hole(p
         there = room((witness.camera,), [FLOOR], block=False).witnesses[0]
         depth, photo = np.where(at, there.depth, witness.depth), np.where(at[..., None], there.photo, witness.photo)
         witnesses.append(replace(witness, hidden=witness.hidden & ~at, depth=depth, photo=photo))
-    (chart,) = draw_charts([Plane.make(np.zeros(3), UP, REGION)], given.views, witnesses, REGION)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], given.views, witnesses)
     uv, _ = chart.camera.project(gap)
     col, row = uv[0].astype(int)
     island = ~chart.hole[row - 2 : row + 3, col - 2 : col + 3]

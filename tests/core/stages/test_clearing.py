@@ -7,22 +7,29 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
-from scenes import BLOCK, REGION, cameras, discs, floor, scene
+from scenes import BLOCK, REGION, cameras, charts_of, discs, floor, scene
 
 from gimp3d.gaussians import Gaussians
-from gimp3d.raster import footprint, surface_depth
-from gimp3d.stages.charts import Chart, Plane, draw_charts
+from gimp3d.geometry import dilated
+from gimp3d.presets import PRESETS
+from gimp3d.raster import footprint, render_bytes, surface_depth
+from gimp3d.stages.charts import Chart, Plane, lay_planes
 from gimp3d.stages.clearing import (
     ClearingSettings,
     Targets,
     chart_targets,
     clear_air,
     object_pixels,
+    sunk_rows,
+    told_by_charts,
     vouching,
 )
-from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.exposure import Exposure
+from gimp3d.stages.masks import Masks, ViewMasks
 from gimp3d.stages.selection import Fate, Selection
 from gimp3d.stages.witness import Says, Witness, ask
+from gimp3d.steps.surfaces import find_surfaces
+from gimp3d.view_state import ViewState
 
 UP = np.array([0.0, 0, 1])
 EYES = cameras(9, 160, 120)
@@ -74,7 +81,7 @@ def plain() -> Removal:
 
 @pytest.fixture(scope="module")
 def charts(plain: Removal) -> tuple[Chart, ...]:
-    return draw_charts([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses, REGION)
+    return charts_of([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses)
 
 
 @pytest.fixture(scope="module")
@@ -123,22 +130,58 @@ def test_rests_on_texels_that_show_the_object_go(charts: tuple[Chart, ...]) -> N
     assert np.abs([x - beside[0], y - beside[1]]).max() < 0.1
 
 
-def test_what_lies_on_a_chart_and_looks_like_it_is_given_back(plain: Removal, charts: tuple[Chart, ...]) -> None:
-    """A splat of uneven floor that selection took; not what is higher, unlike it, in the hole or masked."""
+OFF = 0.45  # x of places on the floor beside the block
+
+
+def with_taken(plain: Removal, places: list[list[float]], fates: list[Fate]) -> tuple[Gaussians, Selection]:
+    whole = plain.scene.extended(specks(places))
+    return whole, Selection(np.concatenate([plain.selection.fates, np.array(fates, np.uint8)]))
+
+
+def test_what_stands_before_no_surface_is_sunk(plain: Removal) -> None:
+    """Of what went for lying in the box, or on the object; a user's mask is another matter, and what stays stays."""
+    places = [[OFF, 0, -0.02], [OFF, 0.1, 0.01], [OFF, 0, -0.02], [OFF, 0, -0.02], [0, 0, -0.02]]
+    fates = [Fate.REMOVED_INSIDE, Fate.REMOVED_INSIDE, Fate.REMOVED_MASKED, Fate.OUTSIDE, Fate.REMOVED_STRADDLING]
+    whole, selection = with_taken(plain, places, fates)
+    laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses, REGION)
+    assert set(sunk_rows(whole, selection, laid) - len(plain.scene)) & set(range(5)) == {0, 4}
+    assert not len(sunk_rows(whole, selection, ()))
+
+
+def test_sunk_splats_stay_where_photos_show_the_surface(plain: Removal, charts: tuple[Chart, ...]) -> None:
+    """Not under the object, and not where photos show it: there what selection left of it goes as well."""
+    places = [[OFF, 0, -0.02], [0, 0, -0.02], [-OFF, 0, -0.02], [-OFF, 0, 0.03], [-OFF, 0, 0.7]]
+    whole, selection = with_taken(plain, places, [Fate.REMOVED_INSIDE] * 3 + [Fate.OUTSIDE] * 2)
     (chart,) = charts
-    chart = replace(chart, noise=0.05)
-    grey = float(chart.image[chart.known].mean()) / 255
-    places = np.array([[0.45, 0.0, 0.02], [0.45, 0.1, 0.3], [0.45, -0.1, 0.0], [0.0, 0.0, 0.0], [0.45, 0.2, 0.0]])
-    shades = np.full((len(places), 3), grey)
-    shades[2] = [0.9, 0.1, 0.1]
-    whole = plain.scene.extended(discs(places, (0, 0, 1), shades, 0.03))
-    taken = np.full(len(places), Fate.REMOVED_INSIDE, np.uint8)
-    taken[-1] = Fate.REMOVED_MASKED
-    given = replace(plain, scene=whole, selection=Selection(np.concatenate([plain.selection.fates, taken])))
-    after = clear_air(whole, REGION, given.selection, given.views, given.witnesses, (chart,))
-    back = given.selection.removed & ~after.removed
-    assert set(np.flatnonzero(back) - len(plain.scene)) == {0}
-    assert (after.fates[back] == Fate.KEPT_SURFACE).all()
+    uv, _ = chart.camera.project(np.array([[-OFF, 0.0, 0.0]]))
+    col, row = uv[0].astype(int)
+    rests = np.zeros_like(chart.rests)
+    rests[row - 3 : row + 4, col - 3 : col + 4] = True
+    chart = replace(chart, rests=rests, hole=chart.hole | rests)
+    sunk = len(plain.scene) + np.arange(3)
+    fates = told_by_charts(whole, REGION, selection, sunk, (chart,)).fates[len(plain.scene) :]
+    inside, kept = Fate.REMOVED_INSIDE, Fate.OUTSIDE
+    assert list(fates) == [Fate.KEPT_SURFACE, inside, inside, Fate.REMOVED_REVEALED, kept]
+
+
+def test_floor_that_selection_took_is_no_object_in_photos() -> None:
+    """Photos show it beside the block, whatever a box that cuts into the floor made of it."""
+    plain = removal()
+    ring = (np.abs(plain.scene.means[:, :2]).max(1) < OFF) & (plain.scene.means[:, 2] < 0.01)
+    whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
+    taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
+    masks = Masks(Selection(taken), tuple(plain.views), (), "need", 1.0, "")
+    photos = [render_bytes(whole, v.camera) for v in plain.views]
+    levelled = Exposure(np.ones(3))
+    views = [ViewState.first(v, photo, levelled) for v, photo in zip(plain.views, photos)]
+    found = find_surfaces(whole, REGION, masks, views, PRESETS["balanced"])
+    back = ring & (found.selection.fates == Fate.KEPT_SURFACE)
+    outside = np.abs(plain.scene.means[:, :2]).max(1) > BLOCK / 2 + 0.06
+    assert back[ring & outside].mean() > 0.9
+    assert found.selection.removed[plain.selection.removed & ~ring].all()
+    for view, (hidden, _), witness in zip(plain.views, found.objects, plain.witnesses):
+        taken_for_it = footprint(whole, view.camera, Selection(taken).removed) > 0.5
+        assert (taken_for_it & ~witness.hidden).sum() > 5 * (hidden & ~dilated(witness.hidden, 3)).sum()
 
 
 def test_haze_within_the_object_goes_and_what_photos_see_stays() -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
-from scenes import BLOCK, REGION, block, cameras, discs, floor, scene, truth
+from scenes import BLOCK, REGION, block, cameras, charts_of, discs, floor, scene, truth
 
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import surface_depth
-from gimp3d.stages.charts import Chart, Plane, draw_charts
+from gimp3d.stages.charts import Chart, Plane
 from gimp3d.stages.clearing import ClearingSettings, Targets, chart_targets, object_pixels
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Reference
@@ -67,7 +67,7 @@ def case(whole: Gaussians) -> Case:
     witnesses = [
         Witness(v.camera, photos[v.camera.id], shown, some, v.depth_before) for v, (shown, some) in zip(views, pixels)
     ]
-    charts = draw_charts([Plane.make(np.zeros(3), np.array([0.0, 0, 1]), REGION)], views, witnesses, REGION)
+    charts = charts_of([Plane.make(np.zeros(3), np.array([0.0, 0, 1]), REGION)], views, witnesses)
     unmarked = [np.zeros((120, 160), bool)] * len(views)
     return Case(
         whole, ~removed, photos, charts, chart_targets(whole, selection, views, witnesses, charts, 0.02, unmarked)

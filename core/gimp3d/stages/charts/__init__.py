@@ -8,7 +8,9 @@ from __future__ import annotations
 import re
 
 from .draw import Chart as Chart
+from .draw import LaidPlane as LaidPlane
 from .draw import draw_charts as draw_charts
+from .draw import lay_planes as lay_planes
 from .find import ChartSettings as ChartSettings
 from .find import find_planes as find_planes
 from .hits import Hits as Hits

@@ -21,7 +21,7 @@ from ..witness import Says, Textures, Witness, ask
 from .find import TOLERANCE, ChartSettings, grid
 from .hits import Facing
 from .plane import Plane, extent
-from .surface import TELLING, facing_camera, lay_surface, pixel_size
+from .surface import TELLING, Laid, facing_camera, lay_surface, pixel_size
 
 VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
@@ -51,22 +51,43 @@ class Chart(Facing):
     reason: str
 
 
-def draw_charts(
+@dataclass(frozen=True)
+class LaidPlane:
+    """A plane with the camera that faces what the object hides of it, and where its surface lies."""
+
+    plane: Plane
+    others: tuple[Plane, ...]  # that it may meet
+    camera: Camera
+    surface: Laid
+
+
+def lay_planes(
     planes: Sequence[Plane],
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],  # of the same views
     region: Region,
     settings: ChartSettings = ChartSettings(),
-    marked: Sequence[np.ndarray] = (),  # [H, W] bool, of the same views: to be filled whatever they show
+) -> tuple[LaidPlane, ...]:
+    """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
+    textures = Textures.make(witnesses)
+    laid = []
+    for plane in planes:
+        placed = _placed(plane, region, views, witnesses, settings)
+        if placed is not None:
+            camera, away = placed
+            surface = lay_surface(camera, away, plane, region, views, witnesses, textures, settings)
+            laid.append(LaidPlane(plane, tuple(p for p in planes if plane.crosses(p)), camera, surface))
+    return tuple(laid)
+
+
+def draw_charts(
+    laid: Sequence[LaidPlane],
+    witnesses: Sequence[Witness],
+    region: Region,
+    marked: Sequence[np.ndarray] = (),  # [H, W] bool, of the witnesses' views: to be filled whatever they show
 ) -> tuple[Chart, ...]:
     """What photos show of the surfaces at the planes; those without a hole are left out."""
-    textures = Textures.make(witnesses)
-    charts: list[Chart] = []
-    for plane in planes:
-        others = [p for p in planes if plane.crosses(p)]
-        chart = _chart(plane, others, region, views, witnesses, marked, textures, settings)
-        if chart is not None:
-            charts.append(chart)
+    charts = [_chart(one, region, witnesses, marked) for one in laid]
     bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
     return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
 
@@ -96,23 +117,9 @@ class _Shown:
     alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
 
 
-def _chart(
-    plane: Plane,
-    others: Sequence[Plane],  # that it may meet
-    region: Region,
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],
-    marked: Sequence[np.ndarray],
-    textures: Textures,
-    settings: ChartSettings,
-) -> Chart | None:
-    """The chart at a plane; None if the object hides nothing of it, or no view faces what it hides."""
-    placed = _placed(plane, region, views, witnesses, settings)
-    if placed is None:
-        return None
-    camera, away = placed
-    surface = lay_surface(camera, away, plane, region, views, witnesses, textures, settings)
-    scatter = _scatter(surface.texels, others, witnesses)
+def _chart(one: LaidPlane, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
+    plane, surface = one.plane, one.surface
+    scatter = _scatter(surface.texels, one.others, witnesses)
     tolerance = max(TOLERANCE, scatter)
     shown = _shown(surface.points, plane, witnesses, tolerance)
     below, rests = _told_by_colours(
@@ -125,7 +132,7 @@ def _chart(
     below &= ~hole
     return Chart(
         plane,
-        camera,
+        one.camera,
         surface.depth,
         shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
