@@ -67,7 +67,11 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "no haze is cleared": (("gimp3d.stages.clearing:HAZE_WEIGHT", math.inf),),
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
     "a tenth of it is": (("clearing.observed", 0.1),),
-    "surface taken for the object stays away": (("gimp3d.stages.clearing:LIKE", -1.0),),
+    "what a box cuts out of a surface counts as the object": (
+        ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
+    ),
+    "rests of the object still hide nothing": (("gimp3d.steps.surfaces:with_rests", lambda selection, *_: selection),),
+    "a surface may have holes": (("gimp3d.stages.charts.draw:_without_leaks", lambda there: there),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),

@@ -92,35 +92,29 @@ def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[LaidPlane])
     return rows[sunk]
 
 
-def told_by_charts(
-    scene: Gaussians,
-    region: Region,
-    selection: Selection,
-    sunk: np.ndarray,  # [M] rows, see sunk_rows
-    charts: Sequence[Chart],  # drawn as if these hid nothing
-) -> Selection:
-    """The object, as photos of surfaces tell it: what they show of a surface is the surface, and no box cuts it out.
+def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, charts: Sequence[Chart]) -> Selection:
+    """The selection without the sunk rows [M] in whose place photos show a surface: no box cuts that out.
 
-    Of sunk splats those stay on whose place photos show the surface; where they show the object instead, what the box
-    left of it goes.
+    The charts are drawn as if these rows hid nothing.
     """
     fates = selection.fates.copy()
     for chart in charts:
         index, *at, _ = framed(chart.camera, scene.means[sunk].astype(np.float64))
         shown = chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below
         fates[sunk[index[shown[tuple(at)]]]] = Fate.KEPT_SURFACE
-    fates[_rests(scene, region, ~selection.removed & near_region(scene, region, 1.0), charts)] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 
-def _rests(scene: Gaussians, region: Region, rows: np.ndarray, charts: Sequence[Chart]) -> np.ndarray:
-    """Those of the rows [N] bool, as indices, that lie low where charts show rests of the object."""
-    among = np.flatnonzero(rows & scene.usable)
-    means, found = scene.means[among].astype(np.float64), np.zeros(len(among), bool)
+def with_rests(selection: Selection, scene: Gaussians, region: Region, charts: Sequence[Chart]) -> Selection:
+    """The selection with what stands low near the region where charts show rests of the object."""
+    fates = selection.fates.copy()
+    rows = np.flatnonzero(~selection.removed & near_region(scene, region, 1.0) & scene.usable)
+    means = scene.means[rows].astype(np.float64)
     for chart in charts:
         rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        found |= rest & (np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region))
-    return among[found]
+        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
+        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
+    return Selection(fates)
 
 
 def clear_air(
@@ -135,14 +129,12 @@ def clear_air(
     """Remove what only the removal reveals and no photo shows, and rests of the object."""
     stays = ~selection.removed
     kept = scene.take(stays)
-    around = near_region(scene, region, 1.0) & stays
-    near = around[stays]
+    near = near_region(scene, region, 1.0)[stays]
     photos, hidden = vouching(kept, near, views, witnesses, settings.observed)
     fates = selection.fates.copy()
     haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
     fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
-    fates[_rests(scene, region, around, charts)] = Fate.REMOVED_REVEALED
-    return Selection(fates)
+    return with_rests(Selection(fates), scene, region, charts)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
-from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, told_by_charts
+from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, with_rests, with_surface
 from ..stages.masks import Masks
 from ..stages.selection import Selection
 from ..stages.witness import Witness
@@ -64,7 +64,7 @@ def find_surfaces(
     standing = masks.removed
     standing[sunk] = False
     charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
-    selection = told_by_charts(scene, region, masks.selection, sunk, charts)
+    selection = with_rests(with_surface(masks.selection, scene, sunk, charts), scene, region, charts)
     given = int((masks.removed & ~selection.removed).sum())
     return replace(
         hidden_by(selection.removed), selection=selection, reason=f"{reason}, {given} Gaussians of theirs stay"

@@ -21,8 +21,9 @@ from gimp3d.stages.clearing import (
     clear_air,
     object_pixels,
     sunk_rows,
-    told_by_charts,
     vouching,
+    with_rests,
+    with_surface,
 )
 from gimp3d.stages.exposure import Exposure
 from gimp3d.stages.masks import Masks, ViewMasks
@@ -159,7 +160,8 @@ def test_sunk_splats_stay_where_photos_show_the_surface(plain: Removal, charts: 
     rests[row - 3 : row + 4, col - 3 : col + 4] = True
     chart = replace(chart, rests=rests, hole=chart.hole | rests)
     sunk = len(plain.scene) + np.arange(3)
-    fates = told_by_charts(whole, REGION, selection, sunk, (chart,)).fates[len(plain.scene) :]
+    surface = with_surface(selection, whole, sunk, (chart,))
+    fates = with_rests(surface, whole, REGION, (chart,)).fates[len(plain.scene) :]
     inside, kept = Fate.REMOVED_INSIDE, Fate.OUTSIDE
     assert list(fates) == [Fate.KEPT_SURFACE, inside, inside, Fate.REMOVED_REVEALED, kept]
 
