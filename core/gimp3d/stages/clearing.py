@@ -99,9 +99,10 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     """
     fates = selection.fates.copy()
     for chart in charts:
-        index, *at, _ = framed(chart.camera, scene.means[sunk].astype(np.float64))
-        shown = chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below
-        fates[sunk[index[shown[tuple(at)]]]] = Fate.KEPT_SURFACE
+        index, *at, z = framed(chart.camera, scene.means[sunk].astype(np.float64))
+        texels = tuple(at)
+        shown = (chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below)[texels]
+        fates[sunk[index[shown & (z > chart.depth[texels])]]] = Fate.KEPT_SURFACE
     return Selection(fates)
 
 

@@ -150,20 +150,23 @@ def test_what_stands_before_no_surface_is_sunk(plain: Removal) -> None:
 
 
 def test_sunk_splats_stay_where_photos_show_the_surface(plain: Removal, charts: tuple[Chart, ...]) -> None:
-    """Not under the object, and not where photos show it: there what selection left of it goes as well."""
-    places = [[OFF, 0, -0.02], [0, 0, -0.02], [-OFF, 0, -0.02], [-OFF, 0, 0.03], [-OFF, 0, 0.7]]
-    whole, selection = with_taken(plain, places, [Fate.REMOVED_INSIDE] * 3 + [Fate.OUTSIDE] * 2)
+    """Not under the object, and not where photos show it: there what selection left of it goes as well.
+
+    What is before this surface lay below another one, which photos may not show there.
+    """
+    places = [[OFF, 0, -0.02], [0, 0, -0.02], [-OFF, 0, -0.02], [OFF, 0, 0.02], [-OFF, 0, 0.03], [-OFF, 0, 0.7]]
+    whole, selection = with_taken(plain, places, [Fate.REMOVED_INSIDE] * 4 + [Fate.OUTSIDE] * 2)
     (chart,) = charts
     uv, _ = chart.camera.project(np.array([[-OFF, 0.0, 0.0]]))
     col, row = uv[0].astype(int)
     rests = np.zeros_like(chart.rests)
     rests[row - 3 : row + 4, col - 3 : col + 4] = True
     chart = replace(chart, rests=rests, hole=chart.hole | rests)
-    sunk = len(plain.scene) + np.arange(3)
+    sunk = len(plain.scene) + np.arange(4)
     surface = with_surface(selection, whole, sunk, (chart,))
     fates = with_rests(surface, whole, REGION, (chart,)).fates[len(plain.scene) :]
     inside, kept = Fate.REMOVED_INSIDE, Fate.OUTSIDE
-    assert list(fates) == [Fate.KEPT_SURFACE, inside, inside, Fate.REMOVED_REVEALED, kept]
+    assert list(fates) == [Fate.KEPT_SURFACE, inside, inside, inside, Fate.REMOVED_REVEALED, kept]
 
 
 def test_floor_that_selection_took_is_no_object_in_photos() -> None:
