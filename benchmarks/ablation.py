@@ -70,7 +70,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what a box cuts out of a surface counts as the object": (
         ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
     ),
-    "rests of the object still hide nothing": (("gimp3d.steps.surfaces:with_rests", lambda selection, *_: selection),),
     "a surface may have holes": (("gimp3d.stages.charts.draw:_without_leaks", lambda there: there),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views

@@ -106,18 +106,6 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     return Selection(fates)
 
 
-def with_rests(selection: Selection, scene: Gaussians, region: Region, charts: Sequence[Chart]) -> Selection:
-    """The selection with what stands low near the region where charts show rests of the object."""
-    fates = selection.fates.copy()
-    rows = np.flatnonzero(~selection.removed & near_region(scene, region, 1.0) & scene.usable)
-    means = scene.means[rows].astype(np.float64)
-    for chart in charts:
-        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
-        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
-    return Selection(fates)
-
-
 def clear_air(
     scene: Gaussians,
     region: Region,
@@ -135,7 +123,13 @@ def clear_air(
     fates = selection.fates.copy()
     haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
     fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
-    return with_rests(Selection(fates), scene, region, charts)
+    rows = np.flatnonzero(stays)[near & kept.usable]
+    means = scene.means[rows].astype(np.float64)
+    for chart in charts:
+        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
+        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
+        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
+    return Selection(fates)
 
 
 @dataclass(frozen=True)

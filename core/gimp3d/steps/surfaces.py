@@ -11,7 +11,7 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
-from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, with_rests, with_surface
+from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, with_surface
 from ..stages.masks import Masks
 from ..stages.selection import Selection
 from ..stages.witness import Witness
@@ -24,7 +24,7 @@ class Surfaces:
 
     planes: tuple[Plane, ...]
     laid: tuple[LaidPlane, ...]  # those of which the object hides something
-    selection: Selection  # without what photos show to be surface, with rests of the object that they show
+    selection: Selection  # without what photos show to be surface
     objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
@@ -64,7 +64,7 @@ def find_surfaces(
     standing = masks.removed
     standing[sunk] = False
     charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
-    selection = with_rests(with_surface(masks.selection, scene, sunk, charts), scene, region, charts)
+    selection = with_surface(masks.selection, scene, sunk, charts)
     given = int((masks.removed & ~selection.removed).sum())
     return replace(
         hidden_by(selection.removed), selection=selection, reason=f"{reason}, {given} Gaussians of theirs stay"
