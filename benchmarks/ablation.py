@@ -70,7 +70,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what a box cuts out of a surface counts as the object": (
         ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
     ),
-    "a surface may have holes": (("gimp3d.stages.charts.draw:_without_leaks", lambda there: there),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),

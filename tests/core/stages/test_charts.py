@@ -15,7 +15,6 @@ from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
-from gimp3d.stages.charts.draw import shown_there
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
@@ -322,15 +321,6 @@ def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
     apart = cv2.dilate(on.astype(np.uint8), np.ones((17, 17))) == 0
     assert (wide_chart.below & apart).sum() > 500
     np.testing.assert_array_equal(chart.hole[apart], wide_chart.hole[apart])
-
-
-def test_a_surface_has_edges_but_no_holes() -> None:
-    """Rough depths fall through it here and there; past a table's edge photos see on to the chart's own."""
-    said = np.full((3, 60, 80), Says.SEEN, np.uint8)
-    said[:, 20:36, 20:36] = Says.THROUGH
-    said[:, :, 60:] = Says.THROUGH
-    there = shown_there(said)
-    assert there[:, :56].all() and not there[:, 64:].any()
 
 
 def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:

@@ -293,9 +293,4 @@ def shown_there(said: np.ndarray) -> np.ndarray:
     # single texels beside the object's foot err; edges of tables are long
     votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
     rows, cols = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return _without_leaks((np.where(known, votes, 0) >= 0)[rows, cols])
-
-
-def _without_leaks(there: np.ndarray) -> np.ndarray:
-    """A surface ends at edges that run out of the chart; where it seems to have holes, rough depths fall through."""
-    return np.asarray(scipy.ndimage.binary_fill_holes(there))
+    return (np.where(known, votes, 0) >= 0)[rows, cols]
