@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
+MIXED = 0.3
 SAMPLES = 128  # colours of each kind, squared, that the two models are made of
 
 
@@ -24,7 +25,9 @@ def shows_object(
     if not doubtful.any() or not len(object_colours) or not len(surface_colours):
         return doubtful & presumed
     rng = np.random.default_rng(0)
-    drawn = (c[rng.integers(0, len(c), (SAMPLES, SAMPLES))] for c in (object_colours, surface_colours))
+    shown, surface = (c[rng.integers(0, len(c), (SAMPLES, SAMPLES))].astype(float) for c in (object_colours, surface_colours))
+    share = rng.uniform(MIXED, 1, (SAMPLES, SAMPLES, 1))
+    drawn = share * shown + (1 - share) * surface, surface
     # a colour without any spread would be a model that nothing else fits, however near
     certain = [np.clip(c + rng.normal(0, GRAIN, c.shape), 0, 255).astype(np.uint8) for c in drawn]
     labels = np.repeat(np.array([cv2.GC_FGD, cv2.GC_BGD], np.uint8), SAMPLES)[:, None].repeat(SAMPLES, 1)

@@ -210,7 +210,7 @@ def _told_by_colours(
     object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
     below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
     below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
-    return below, object_ & (s.photos > 0)
+    return below, dilated(object_ & ~s.hole, MIXED) & (s.photos > 0)
 
 
 def _without_islands(
