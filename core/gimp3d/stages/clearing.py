@@ -106,6 +106,22 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     return Selection(fates)
 
 
+def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
+    """The witnesses, which show the object where they show rests of it as well."""
+    if not any(chart.rests.any() for chart in charts):
+        return list(witnesses)
+
+    def of(witness: Witness) -> Witness:
+        hits = first_hits(charts, witness.camera, np.ones(witness.hidden.shape, bool))
+        rests = np.zeros(witness.hidden.shape, bool)
+        for number, chart in enumerate(charts):
+            there = (hits.chart == number) & ~hits.behind(witness.depth, chart.tolerance)
+            rests[there] = chart.rests[hits.rows[there], hits.cols[there]]
+        return replace(witness, hidden=witness.hidden | rests)
+
+    return parallel_map(of, witnesses)
+
+
 def clear_air(
     scene: Gaussians,
     region: Region,

@@ -11,7 +11,7 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
-from ..stages.clearing import Targets, chart_targets, clear_air, object_pixels, sunk_rows, with_surface
+from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
 from ..stages.masks import Masks
 from ..stages.selection import Selection
 from ..stages.witness import Witness
@@ -96,7 +96,7 @@ def chart_surfaces(
     charts = draw_charts(surfaces.laid, witnesses, region, marked)
     if not charts:
         return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
-    tolerance = max(c.tolerance for c in charts)
+    tolerance, witnesses = max(c.tolerance for c in charts), hiding_rests(witnesses, charts)
     selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, settings.clearing)
     targets = chart_targets(scene, selection, masks.views, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
