@@ -11,7 +11,7 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
-from ..geometry import dilated, framed, sees, window_mask
+from ..geometry import dilated, framed, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
 from .charts import Chart, Hits, LaidPlane, extent, first_hits
@@ -107,7 +107,7 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
 
 
 def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
-    """The witnesses, which show the object where they show rests of it as well."""
+    """The witnesses with rests of the object as part of it: photos of them vouch for nothing, and are filled."""
     if not any(chart.rests.any() for chart in charts):
         return list(witnesses)
 
@@ -142,9 +142,11 @@ def clear_air(
     rows = np.flatnonzero(stays)[near & kept.usable]
     means = scene.means[rows].astype(np.float64)
     for chart in charts:
-        rest = sees(chart.camera, chart.rests.astype(np.float32), means, np.inf)
-        low = np.abs(chart.plane.local(means)[:, 2]) < LOW * extent(region)
-        fates[rows[rest & low]] = Fate.REMOVED_REVEALED
+        index, *at, z = framed(chart.camera, means)
+        above = chart.depth[tuple(at)] - z
+        # on a hole stands nothing but the object; surface that reaches below it stays if some photo shows it
+        on = chart.rests[tuple(at)] | (chart.hole[tuple(at)] & (above > 0))
+        fates[rows[index[on & (np.abs(above) < LOW * extent(region))]]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 

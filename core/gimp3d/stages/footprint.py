@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
-MIXED = 0.3
+LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
 SAMPLES = 128  # colours of each kind, squared, that the two models are made of
 
 
@@ -25,8 +25,10 @@ def shows_object(
     if not doubtful.any() or not len(object_colours) or not len(surface_colours):
         return doubtful & presumed
     rng = np.random.default_rng(0)
-    shown, surface = (c[rng.integers(0, len(c), (SAMPLES, SAMPLES))].astype(float) for c in (object_colours, surface_colours))
-    share = rng.uniform(MIXED, 1, (SAMPLES, SAMPLES, 1))
+    shown, surface = (
+        c[rng.integers(0, len(c), (SAMPLES, SAMPLES))].astype(float) for c in (object_colours, surface_colours)
+    )
+    share = rng.uniform(LEAST_SHARE, 1, (SAMPLES, SAMPLES, 1))
     drawn = share * shown + (1 - share) * surface, surface
     # a colour without any spread would be a model that nothing else fits, however near
     certain = [np.clip(c + rng.normal(0, GRAIN, c.shape), 0, 255).astype(np.uint8) for c in drawn]

@@ -201,7 +201,8 @@ def _told_by_colours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there.
 
-    Where photos agree below it, and on the surface's colours, they show the surface.
+    Where photos agree below it, and on the surface's colours, they show the surface. Texels right beside the object's
+    mix with it.
     """
     s = shown
     far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
