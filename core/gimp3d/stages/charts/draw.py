@@ -211,7 +211,9 @@ def _told_by_colours(
     object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
     below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
     below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
-    return below, dilated(object_ & ~s.hole, MIXED) & (s.photos > 0)
+    rests = object_ & s.known  # photos would not agree on something else that stands there
+    spots = cv2.morphologyEx(rests.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return below, (rests | dilated(spots, MIXED)) & (s.photos > 0)
 
 
 def _without_islands(
