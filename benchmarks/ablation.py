@@ -70,6 +70,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what a box cuts out of a surface counts as the object": (
         ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
     ),
+    "photos of rests vouch for them, and are not filled": (
+        ("gimp3d.steps.surfaces:hiding_rests", lambda witnesses, _: witnesses),
+    ),
+    "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),

@@ -14,7 +14,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
-from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw, extent, find, find_planes, first_hits
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
@@ -483,3 +483,23 @@ def test_what_a_single_photo_shows_through_the_object_is_no_island_in_the_hole(p
     col, row = uv[0].astype(int)
     island = ~chart.hole[row - 2 : row + 3, col - 2 : col + 3]
     assert island.all() if photos > 1 else not island.any()
+
+
+def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
+    """Beside the hole: a spot of the object's red, two like it that photos disagree on or that is a speck."""
+    shape, rng = (60, 80), np.random.default_rng(1)
+    no, red = np.zeros(shape, bool), np.zeros(shape, bool)
+    hole = no.copy()
+    hole[20:40, 30:50] = True
+    agreed, disputed, speck = np.s_[27:32, 24:28], np.s_[27:32, 52:56], np.s_[15, 40]
+    for place in (hole, agreed, disputed, speck):
+        red[place] = True
+    known = ~hole
+    known[disputed] = False
+    colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
+    image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
+    shown = draw._Shown(~no, image, photos, np.uint16(5) - photos, known, hole, ~no)
+    _, rests = draw._told_by_colours(shown, image[hole], no, no)
+    assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
+    assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed
+    assert rests[12:18, 37:44].sum() == 1

@@ -61,3 +61,12 @@ def test_the_same_twice(scene: tuple[np.ndarray, np.ndarray]) -> None:
     doubtful, colours = np.ones_like(red), (around(RED, 500), around(WOOD, 500))
     first, second = (shows_object(picture, doubtful, red, *colours) for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_mixed_edge_is_the_object_s(scene: tuple[np.ndarray, np.ndarray]) -> None:
+    """Half red, half wood: neither of the two looks like it. A tenth of red is wood."""
+    picture, red = scene
+    share = np.where(red, 0.5, 0.1)[..., None]
+    picture = np.clip(share * RED + (1 - share) * WOOD + RNG.normal(0, 4, picture.shape), 0, 255).astype(np.uint8)
+    found = shows_object(picture, np.ones_like(red), red, around(RED, 500), around(WOOD, 500))
+    assert found[red].mean() > 0.95 and found[~red].mean() < 0.02
