@@ -73,6 +73,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "photos of rests vouch for them, and are not filled": (
         ("gimp3d.steps.surfaces:hiding_rests", lambda witnesses, _: witnesses),
     ),
+    "what stands on holes stays if a photo shows it": (
+        ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
+    ),
     "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # into the other views

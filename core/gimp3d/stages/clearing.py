@@ -106,6 +106,14 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     return Selection(fates)
 
 
+def stand_on_rests(chart: Chart, texels: tuple[np.ndarray, ...], above: np.ndarray) -> np.ndarray:
+    """[N] bool: of Gaussians over these (rows, cols), so far above the surface, those that are the object's if low.
+
+    On a hole stands nothing but the object; surface that reaches below one stays if some photo shows it.
+    """
+    return chart.rests[texels] | (chart.hole[texels] & (above > 0))
+
+
 def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
     """The witnesses with rests of the object as part of it: photos of them vouch for nothing, and are filled."""
     if not any(chart.rests.any() for chart in charts):
@@ -144,9 +152,8 @@ def clear_air(
     for chart in charts:
         index, *at, z = framed(chart.camera, means)
         above = chart.depth[tuple(at)] - z
-        # on a hole stands nothing but the object; surface that reaches below it stays if some photo shows it
-        on = chart.rests[tuple(at)] | (chart.hole[tuple(at)] & (above > 0))
-        fates[rows[index[on & (np.abs(above) < LOW * extent(region))]]] = Fate.REMOVED_REVEALED
+        gone = stand_on_rests(chart, tuple(at), above) & (np.abs(above) < LOW * extent(region))
+        fates[rows[index[gone]]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 

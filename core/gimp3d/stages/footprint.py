@@ -20,7 +20,8 @@ def shows_object(
     """[H, W] bool: doubtful texels that look like the object; the presumed ones where there is nothing to compare.
 
     Two Gaussian mixtures and a minimum cut along edges of the picture (GrabCut: Rother 2004). The models stay as they
-    are learned from what is certain: in the doubtful texels either kind may be missing.
+    are learned from what is certain: in the doubtful texels either kind may be missing. The object's is of its colours
+    mixed with the surface's, as its edges are.
     """
     if not doubtful.any() or not len(object_colours) or not len(surface_colours):
         return doubtful & presumed
