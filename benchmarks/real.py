@@ -163,7 +163,7 @@ def measured(scene: Scene, run: Run, folder: Path, reuse: bool) -> Row:
     render_views(out, cameras, folder / "render", **drawn)
     if scene.has_truth:
         file = read_ply(out)
-        new = np.arange(len(file.gaussians)) >= counts["gaussians_out"] - counts["added"] + counts["lifted"]
+        new = np.arange(len(file.gaussians)) >= counts["gaussians_out"] - counts["added"] + counts["changed"]
         views = [(c, covered(scene, c, run.marked)) for c in scene.train]
         astray = outside_hidden_volume(file.gaussians.means[new], views)
         row |= {"outside": float(astray.mean()) if new.any() else 0.0, **scored(scene, folder / "render")}

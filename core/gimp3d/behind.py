@@ -15,18 +15,21 @@ from .stages.charts import Chart
 from .stages.exposure import exposures_of
 from .stages.masks import Masks
 from .steps.light import NOT_LIT, Found, Relit, find_light, undo_light, with_contact
+from .steps.relearning import relearn
 from .steps.surfaces import Charted, chart_surfaces, find_surfaces
 from .view_state import ViewState
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2")  # stages that a removal with --shadow off lacks
-BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT)  # stages that know nothing of fills
+BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "relearn")  # stages that know nothing of fills
 
 
 @dataclass(frozen=True)
 class Behind:
     """What is behind the object, and the scene in the light that it would have without it."""
 
-    scene: Gaussians
+    before: Gaussians  # the scene with the object, in that light
+    scene: Gaussians  # the same, but what stays round the object is learned anew
+    changed: np.ndarray  # [M] rows of it that are not as they came
     masks: Masks  # with what had to be cleared away; if there are charts, T is what no photo shows of them
     views: tuple[ViewState, ...]
     charts: tuple[Chart, ...]
@@ -46,7 +49,7 @@ def look_behind(
     exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos)
     views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views))
     if settings.charts is None or masks.mode != "need":
-        return Behind(scene, masks, views, (), lit)
+        return Behind(scene, scene, lit.rows, masks, views, (), lit)
     surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
     masks = replace(masks, selection=surfaces.selection)
 
@@ -75,4 +78,9 @@ def look_behind(
         targets = charted.targets
         masks = replace(masks, selection=charted.selection, views=targets.views)
         views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
-    return Behind(scene, masks, views, charted.charts, lit)
+    if not settings.refine.steps:
+        return Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
+    inputs = scene, region, masks.removed, views, charted.charts, settings, run.progress
+    learned = run("relearn", relearn, *inputs)
+    changed = np.union1d(lit.rows, learned.rows)
+    return Behind(scene, learned.scene(scene), changed, masks, views, charted.charts, lit)

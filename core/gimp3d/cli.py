@@ -25,6 +25,7 @@ from .errors import BadInput, Cancelled, Gimp3dError, Terminated
 from .files import identity, user_state_folder, write_atomically, write_json
 from .job import PROVIDERS, SHADOWS, RemovalJob, load_job, save_job
 from .memory import require_base_memory
+from .progress import count_words
 
 Namespace = argparse.Namespace
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH|torchscript:PATH|command:CMD, then ,disparity|,depth|,metric"
@@ -314,11 +315,9 @@ def _remove(given: Namespace, shown: Reporter) -> None:
         return
     shown.last(stage="done", summary=summary)
     if not given.quiet and given.progress == "bar":
-        counts = summary["counts"]
         seconds = time.perf_counter() - start
         written = ", ".join(v["out"] for v in summary["variants"])
-        words = f"removed {counts['removed']} and added {counts['added']} Gaussians in {seconds:.1f} s: {written}"
-        say(words, sys.stdout)
+        say(f"{count_words(summary['counts'])} in {seconds:.1f} s: {written}", sys.stdout)
         if summary["verdict"]:
             say(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}", sys.stdout)
     if given.progress != "json":

@@ -163,5 +163,6 @@ def refine(run: Run, filling: Filling) -> Filling:
     if filling.added is None or not settings.refine.steps:
         return filling
     seen = [observed(v.camera, v.painted, v.rules) for v in filling.views if v.rules is not None]
+    seen = [o for o in seen if o.weight.any()]
     inputs = filling.kept, filling.added, seen, settings.refine, settings.random_seed, run.progress
     return replace(filling, added=run("refine", refine_gaussians, *inputs).gaussians)

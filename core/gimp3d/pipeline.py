@@ -114,7 +114,7 @@ def _remove(
     masks = _find_object(run, scene, views, region, extra_masks)
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
-        return NOT_LIT.with_changes(_result(run, masks, {}), scene)
+        return _result(run, masks, NOT_LIT, {})
     behind = look_behind(run, scene, region, masks, {v.camera.id: v.image for v in views}, shadow_masks or {})
     masks, to_paint = behind.masks, charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
@@ -136,14 +136,14 @@ def _remove(
     verdict = _judge(run, views, behind, filling, filling.done[0] if filling.done and by_picture else None)
     completed = {r.camera.id: r.image for r in filling.done}
     result = replace(
-        _result(run, masks, _painted(filling, behind.lit) if masks.hole_pixels else {}),
+        _result(run, masks, behind.lit, _painted(filling, behind.lit) if masks.hole_pixels else {}),
         added=filling.added,
         open_pixels=left,
         charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
         verdict=verdict,
         refined_views=filling.asked,
     )
-    return behind.lit.with_changes(result, scene)
+    return _with_changed(result, behind)
 
 
 def _find_object(
@@ -172,9 +172,8 @@ def _judge(
     return run(
         "verdict",
         judge,
-        behind.scene,
-        ~behind.masks.removed,
-        filling.added,
+        behind.before,
+        filling.filled,
         behind.masks.views,
         [v.left.target for v in filling.views],
         {v.id: v.bare for v in filling.views},
@@ -216,7 +215,19 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     return dict(zip((v.id for v in filling.views), parallel_map(finished, enumerate(filling.views))))
 
 
-def _result(run: Run, masks: Masks, painted: dict[str, np.ndarray]) -> RemovalResult:
+def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
+    """The result with the Gaussians that stay, but not as they were: they count as removed and added."""
+    changed = np.zeros(len(result.keep), bool)
+    changed[behind.changed] = True
+    changed &= result.keep  # some were taken away since
+    if not changed.any():
+        return result
+    anew = behind.scene.take(changed)
+    added = anew if result.added is None else anew.extended(result.added)
+    return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
+
+
+def _result(run: Run, masks: Masks, lit: Relit, painted: dict[str, np.ndarray]) -> RemovalResult:
     return RemovalResult(
         keep=~masks.removed,
         added=None,
@@ -229,6 +240,9 @@ def _result(run: Run, masks: Masks, painted: dict[str, np.ndarray]) -> RemovalRe
         warnings=tuple(run.warnings),
         selection=masks.selection.counts,
         proposed=masks.proposed,
+        shadow=lit.shadow,
+        reflection=lit.reflection,
+        lifted=int((~masks.removed)[lit.rows].sum()),
     )
 
 

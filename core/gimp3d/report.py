@@ -19,6 +19,7 @@ from .geometry import disparity_of
 from .io.cameras import write_transforms
 from .io.images import write_png
 from .pipeline import Picture, RemovalResult, View, render_bytes
+from .progress import count_words
 from .stages.charts import Chart
 from .stages.propagate import Rule
 from .stages.reference import ReferenceChoice
@@ -275,7 +276,7 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
     numbers = (counts | summary.get("selection", {})).items()
     return PAGE.substitute(
         style=STYLE,
-        facts=f"{counts['removed']:,} Gaussians removed, {counts['added']:,} added, {summary['seconds_total']:.1f} s, "
+        facts=f"{count_words(counts)}, {summary['seconds_total']:.1f} s, "
         f"peak memory {summary['peak_memory_mb']:.0f} MB, version {escape(summary['version'])}.",
         verdict=_verdict(summary.get("verdict")),
         warnings="".join(f"<p class=warn>{escape(w)}</p>" for w in summary["warnings"]),

@@ -65,5 +65,6 @@ class RemovalResult:
     proposed: dict[str, Any] = field(default_factory=dict)  # what of the object the boxes cut off, see Growth.facts
     shadow: dict[str, Any] = field(default_factory=dict)  # see Shadow.facts
     reflection: dict[str, Any] = field(default_factory=dict)  # see Reflection.facts
-    lifted: int = 0  # Gaussians that are removed and added as their light changed
+    lifted: int = 0  # Gaussians that stay in another light
+    changed: int = 0  # … or otherwise not as they were: removed, and the first of those added
     refined_views: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts; empty: nobody was asked

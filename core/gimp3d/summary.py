@@ -42,6 +42,7 @@ def summary_of(
             "added": added,
             "gaussians_out": len(file.gaussians) - removed + added,
             "lifted": result.lifted,
+            "changed": result.changed,
             **_cost(file, result.added),
             "views": result.views,
             "hole_pixels": result.hole_pixels,

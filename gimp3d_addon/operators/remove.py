@@ -13,6 +13,7 @@ from mathutils import Matrix
 from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
+from gimp3d.progress import count_words
 
 from .. import charts, jobs, splats, steps
 from ..chosen import current_boxes, current_splat, present
@@ -76,10 +77,7 @@ class RunsRemoval(AsksFirst):
         verdict = summary["verdict"] or {"score": 1.0, "words": []}
         settings.score, settings.verdict = verdict["score"], "\n".join(verdict["words"])
         settings.hole = f"{counts['hole_pixels']:,} pixels in {counts['views']} views"
-        self.report(
-            {"INFO"}, f"{result.name}: {counts['removed']:,} splats removed, {counts['added']:,} added "
-            f"in {duration(seconds)}",
-        )  # fmt: skip
+        self.report({"INFO"}, f"{result.name}: {count_words(counts, 'splats')} in {duration(seconds)}")
 
 
 class GIMP3D_OT_remove_object(RunsRemoval, bpy.types.Operator):

@@ -16,7 +16,7 @@ from ..raster import label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import decoded, encoded, linear
 from .charts.find import TOLERANCE
-from .charts.hits import Hits, first_hits
+from .charts.hits import Hits, first_hits, pictured
 from .ground import Ground
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
@@ -170,12 +170,7 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
 
 def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarray:
     """[H, W] bool: the photo shows the ground that its rays meet."""
-    known, hole = np.zeros((2, *hits.chart.shape), bool)
-    expected = np.zeros_like(witness.photo)
-    for number, ground in enumerate(grounds):
-        on = hits.chart == number
-        at = hits.rows[on], hits.cols[on]
-        known[on], hole[on], expected[on] = ground.known[at], ground.hole[at], ground.image[at]
+    expected, known, hole = pictured(grounds, hits)
     weight = known.astype(np.float32)
     off = cv2.absdiff(expected, witness.photo).max(-1) * weight
     off = cv2.boxFilter(off, -1, (PATCH, PATCH)) / np.maximum(cv2.boxFilter(weight, -1, (PATCH, PATCH)), 1e-3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, TypeVar
 
@@ -82,19 +82,21 @@ def refine_gaussians(
     settings: RefineSettings = RefineSettings(),
     seed: int = 0,
     progress: Progress = silent,
+    learned: Collection[str] = (*RATES, "sh"),  # what of the new Gaussians moves
+    margin: int = MARGIN,  # px of known picture round the targets that counts as well
 ) -> Refinement:
     """Adam on the new Gaussians alone, over the tiles that the targets cover; the rest of the scene does not move.
 
     Every HELD_OUT-th view is left out of the gradient. The state that it likes best is kept, so the result is never
     worse there than the start. Without steps, views or new Gaussians the input is returned.
     """
-    seen = looked_at([o for o in observations if (o.weight[o.target] > 0).any()], settings)
+    seen = looked_at([o for o in observations if _counting(o, margin).any()], settings)
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
-    views = parallel_map(lambda o: _View(frozen, o), seen)
+    views = parallel_map(lambda o: _View(frozen, o, margin), seen)
     judges = views[HELD_OUT // 2 :: HELD_OUT] or views[:1]
     learners = [v for v in views if v not in judges] or views
-    state = _State(new)
+    state = _State(new, learned)
     rng = np.random.default_rng(seed)
 
     def judged() -> float:
@@ -123,14 +125,21 @@ def refine_gaussians(
     return Refinement(kept, kept_step, before, best, min(1.0, before / max(best, 1e-9) - 1), reason)
 
 
+def _counting(observation: Observation, margin: int) -> np.ndarray:
+    """[H, W] float32, how far pixels count: the target as it is trusted; round it the photo itself counts fully."""
+    target = observation.target
+    return np.where(target, observation.weight, dilated(target, margin)).astype(np.float32)
+
+
 class _State:
     """The new Gaussians on their way: Adam (Kingma 2015)."""
 
-    def __init__(self, new: Gaussians) -> None:
+    def __init__(self, new: Gaussians, learned: Collection[str] = (*RATES, "sh")) -> None:
         size = float(np.exp(np.median(new.log_scales)))
         colour = np.full((new.sh.shape[1], 1), VIEW_DEPENDENCE, np.float32)
         colour[0] = COLOUR
-        self.rates: dict[str, float | np.ndarray] = {**RATES, "means": RATES["means"] * size, "sh": colour}
+        rates: dict[str, float | np.ndarray] = {**RATES, "means": RATES["means"] * size, "sh": colour}
+        self.rates = {name: rate for name, rate in rates.items() if name in learned}
         self.gaussians = replace(new, **{name: getattr(new, name).copy() for name in self.rates})
         self.moments = {name: np.zeros((2, *getattr(new, name).shape), np.float32) for name in self.rates}
         self.steps = 0
@@ -154,13 +163,13 @@ class _State:
 class _View:
     """A view's part of the loss: what does not change between steps is prepared once."""
 
-    def __init__(self, frozen: Gaussians, observation: Observation) -> None:
+    def __init__(self, frozen: Gaussians, observation: Observation, margin: int = MARGIN) -> None:
         self.camera = observation.camera
-        counted = dilated(observation.target, MARGIN)
+        counting = _counting(observation, margin)
+        counted = counting > 0
         self.region: PixelRegion = pixel_region(frozen, self.camera, counted, passes=frozenset({"rgb", "alpha"}))
         self.window = bounds(counted, WINDOW // 2)
-        # Round the target the photo itself counts fully.
-        weight = (np.where(observation.target, observation.weight, 1.0) * counted)[self.window]
+        weight = counting[self.window]
         self.share = (weight / weight.sum()).astype(np.float32)  # of each pixel in the loss
         self.image = observation.image[self.window].astype(np.float32) / 255
         self.counted = counted[self.window]

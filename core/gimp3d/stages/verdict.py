@@ -93,9 +93,8 @@ class _Sample:
 
 
 def judge(
-    scene: Gaussians,
-    keep: np.ndarray,  # [N] bool
-    added: Gaussians | None,
+    scene: Gaussians,  # with the object
+    final: Gaussians,  # without it, filled
     views: Sequence[ViewMasks],  # as they were to be filled
     still_open: Sequence[np.ndarray],  # [H, W] bool each: what no reference reached
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, with the object, at the splats' exposure
@@ -105,8 +104,6 @@ def judge(
     given: Reference | None = None,  # that a picture was given for
 ) -> Verdict | None:
     """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
-    kept = scene.take(keep)
-    final = kept if added is None else kept.extended(added)
     asked = [v for v in views if v.camera.id in photographed] or list(views)
     witnesses = [_witness(v.camera, photos[v.camera.id], v.silhouette, v.depth_before) for v in asked]
     floats, unsure = _floating(final, charts, witnesses), [_height_doubt(c) for c in charts]

@@ -11,7 +11,6 @@ import numpy as np
 from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
-from ..result import RemovalResult
 from ..stages.charts import Chart
 from ..stages.contact import find_contact
 from ..stages.ground import look_at
@@ -131,6 +130,11 @@ class Relit:
         """The scene in its new light."""
         return scene if self.lifted is None else self.lifted.scene(scene)
 
+    @property
+    def rows(self) -> np.ndarray:
+        """[M] of the scene, whose light changed."""
+        return np.zeros(0, int) if self.lifted is None else self.lifted.rows
+
     def views(self, views: Sequence[ViewState]) -> tuple[ViewState, ...]:
         """The views in it."""
         if self.lifted is None:
@@ -140,18 +144,6 @@ class Relit:
     def shaded(self, number: int) -> np.ndarray | bool:
         """[H, W] bool: where a view, by its index, changed."""
         return False if self.lifted is None else self.lifted.shaded[number]
-
-    def with_changes(self, result: RemovalResult, scene: Gaussians) -> RemovalResult:
-        """The result with the Gaussians whose light changed: as any changed row, they are removed and added."""
-        result = replace(result, shadow=self.shadow, reflection=self.reflection)
-        if self.lifted is None or not len(self.lifted.rows):
-            return result
-        changed = np.zeros(len(scene), bool)
-        changed[self.lifted.rows] = True
-        changed &= result.keep  # some were taken away since
-        relit = self.lifted.scene(scene).take(changed)
-        added = relit if result.added is None else relit.extended(result.added)
-        return replace(result, keep=result.keep & ~changed, added=added, lifted=int(changed.sum()))
 
 
 NOT_LIT = Relit(None, {**NO_SHADOW, "reason": NOT_LOOKED_FOR}, {**NO_REFLECTION, "reason": NOT_LOOKED_FOR})

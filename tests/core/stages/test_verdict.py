@@ -46,7 +46,9 @@ class Case:
         hits = {v.camera.id: h for v, h in zip(views, self.targets.hits)} if with_charts else {}
         seen = set(self.photos) if photographed else set()
         charts = self.charts if with_charts else ()
-        found = judge(self.scene, self.keep, added, views, left, photos or self.photos, seen, charts, hits, given)
+        kept = self.scene.take(self.keep)
+        final = kept if added is None else kept.extended(added)
+        found = judge(self.scene, final, views, left, photos or self.photos, seen, charts, hits, given)
         assert found is not None
         return found
 
@@ -194,4 +196,4 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
 def test_nothing_to_judge(plain: Case, patch: Gaussians) -> None:
     none = np.zeros((120, 160), bool)
     views = [replace(v, silhouette=none, target=none) for v in plain.targets.views]
-    assert judge(plain.scene, plain.keep, patch, views, [none] * len(views), plain.photos, set(plain.photos)) is None
+    assert judge(plain.scene, plain.scene, views, [none] * len(views), plain.photos, set(plain.photos)) is None

@@ -15,6 +15,7 @@ from .find import ChartSettings as ChartSettings
 from .find import find_planes as find_planes
 from .hits import Hits as Hits
 from .hits import first_hits as first_hits
+from .hits import pictured as pictured
 from .plane import Plane as Plane
 from .plane import extent as extent
 from .surface import CHART as CHART

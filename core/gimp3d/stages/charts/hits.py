@@ -48,6 +48,17 @@ class Hits:
         return (depth > 0) & (depth < (1 - tolerance) * self.depth)
 
 
+def pictured(surfaces: Sequence[Facing], hits: Hits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the surfaces show where a view meets them, [H, W, 3] uint8, where that is known, and holes, [H, W] bool."""
+    image = np.zeros((*hits.chart.shape, 3), np.uint8)
+    known, hole = np.zeros((2, *hits.chart.shape), bool)
+    for number, surface in enumerate(surfaces):
+        on = hits.chart == number
+        at = hits.rows[on], hits.cols[on]
+        image[on], known[on], hole[on] = surface.image[at], surface.known[at], surface.hole[at]
+    return image, known, hole
+
+
 def first_hits(
     surfaces: Sequence[Facing],
     camera: Camera,

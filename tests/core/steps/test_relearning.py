@@ -1,0 +1,110 @@
+"""What stays round the object learns from photos, and from charts where what it draws cannot be true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scenes import BLOCK, REGION, cameras, scene
+
+from gimp3d.behind import Behind, look_behind
+from gimp3d.evaluate.metrics import psnr
+from gimp3d.gaussians import ARRAYS, Gaussians
+from gimp3d.geometry import dilated
+from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
+from gimp3d.run import Run
+from gimp3d.stages import refine
+from gimp3d.stages.charts import pictured
+from gimp3d.stages.masks import find_masks
+from gimp3d.steps.coverage import emptied
+from gimp3d.steps.relearning import observed_round
+
+SETTINGS = replace(PRESETS["balanced"], refine=replace(PRESETS["balanced"].refine, steps=50), shadow="off")
+SPOILT = 0.3  # scene units round the block
+
+
+def spoilt() -> Gaussians:
+    """The block on its floor, which was fitted too dark right round it."""
+    whole = scene()
+    away = np.abs(whole.means[:, :2]).max(1) - BLOCK / 2
+    near = (whole.means[:, 2] == 0) & (away > 0.01) & (away < SPOILT)
+    sh = whole.sh.copy()
+    sh[near] -= 0.1
+    return replace(whole, sh=sh)
+
+
+@cache
+def views() -> tuple[View, ...]:
+    return tuple(View(c, render_bytes(scene(), c)) for c in cameras(9))
+
+
+@cache
+def behind() -> Behind:
+    photos = {v.camera.id: v.image for v in views()}
+    masks = find_masks(spoilt(), REGION, [v.camera for v in views()], SETTINGS.masks, photos=photos)
+    return look_behind(Run(SETTINGS), spoilt(), REGION, masks, photos, {})
+
+
+def fidelity(gaussians: Gaussians) -> float:
+    """PSNR of photos round the object's place."""
+    found = []
+    for view in behind().views:
+        place = view.masks.silhouette | view.masks.target
+        drawn = render_bytes(gaussians, view.camera)
+        found.append(psnr(drawn, view.photo, dilated(place, 8) & ~place))
+    return float(np.mean(found))
+
+
+def test_colours_round_the_object_become_those_of_photos() -> None:
+    stays = ~behind().masks.removed
+    before, after = behind().before.take(stays), behind().scene.take(stays)
+    assert fidelity(after) > fidelity(before) + 2
+    changed = np.zeros(len(stays), bool)
+    changed[behind().changed] = True
+    assert 0 < changed.sum() < 0.5 * stays.sum() and not (changed & ~stays).any()
+    for name in ARRAYS:
+        old, new = getattr(behind().before, name), getattr(behind().scene, name)
+        np.testing.assert_array_equal(old[~changed], new[~changed])
+        if name not in ("sh", "opacity_logits"):
+            np.testing.assert_array_equal(old, new)
+
+
+def test_what_learned_counts_as_removed_and_added_and_comes_first() -> None:
+    result = remove_object(spoilt(), views(), REGION, SETTINGS)
+    assert result.changed > 0 and result.lifted == 0 and result.added is not None
+    back = {tuple(m) for m in spoilt().means[~result.keep]}
+    assert all(tuple(m) in back for m in result.added.means[: result.changed])
+    assert not any(tuple(m) in back for m in result.added.means[result.changed :])
+
+
+def test_draft_leaves_what_stays_as_it_is() -> None:
+    assert remove_object(spoilt(), views(), REGION, PRESETS["draft"]).changed == 0
+
+
+def test_what_held_out_views_do_not_like_is_not_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(refine, "COLOUR", 5.0)
+    behind.cache_clear()
+    try:
+        assert len(behind().changed) == 0
+        assert behind().scene.sh.tobytes() == behind().before.sh.tobytes()
+    finally:
+        behind.cache_clear()
+
+
+def test_charts_teach_what_cannot_be_true() -> None:
+    kept = behind().scene.take(~behind().masks.removed)
+    view = emptied(kept, behind().views)[3]
+    assert view.hits is not None
+    shown, known, hole = pictured(behind().charts, view.hits)
+    place = view.masks.silhouette & ~view.masks.target & known & ~hole
+    rows, cols = np.nonzero(place)
+    patch = np.zeros_like(place)
+    patch[rows[0] : rows[0] + 6, cols[0] - 6 : cols[0] + 6] = True
+    hazy = replace(view, painted=np.where(patch[..., None], [0, 0, 255], view.painted).astype(np.uint8))
+    for seen, few in ((observed_round(view, behind().charts), True), (observed_round(hazy, behind().charts), False)):
+        taught = seen.weight > 0
+        assert not (taught & ~place).any()
+        np.testing.assert_array_equal(seen.image[taught], shown[taught])
+        assert taught[patch & place].mean() < 0.5 if few else taught[patch & place].all()
