@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from gimp3d.errors import BadInput, IllPosed
+from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.exemplar import EDGE
 
@@ -78,6 +79,11 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
+    # what stays round it
+    "what stays learns nothing": (("gimp3d.steps.relearning:SHOWN", math.inf),),
+    "charts teach what stays nothing": (("gimp3d.steps.relearning:WRONG", math.inf),),
+    "shapes of what stays learn too": (("gimp3d.steps.relearning:LEARNED", ARRAYS),),
+    "what draws other places more learns too": (("gimp3d.steps.relearning:SHARE", 0.0),),
     # into the other views
     "no colours learned: the warp": (("propagate.transfer", "none"),),
     "the paper's sampling": (("propagate.transfer", "sample"),),

@@ -22,9 +22,10 @@ from gimp3d.commands import render_views
 from gimp3d.errors import BadInput
 from gimp3d.evaluate.benchmark import empty_region, score_renders, telea
 from gimp3d.evaluate.metrics import psnr
-from gimp3d.geometry import bounds
+from gimp3d.geometry import SAME_DEPTH, bounds
 from gimp3d.io.images import read_image, read_mask, write_png
 from gimp3d.io.ply import read_ply, write_ply
+from gimp3d.raster import surface_depth
 
 from .command import parser_of, say, told_in_one_line, write, write_results
 from .scenes import MADE, REAL, Scene, gimp3d, read_scenes, remove_words, scene_words, shadow_words
@@ -164,7 +165,7 @@ def measured(scene: Scene, run: Run, folder: Path, reuse: bool) -> Row:
     if scene.has_truth:
         file = read_ply(out)
         new = np.arange(len(file.gaussians)) >= counts["gaussians_out"] - counts["added"] + counts["changed"]
-        views = [(c, covered(scene, c, run.marked)) for c in scene.train]
+        views = [(c, covered(scene, c, run.marked), surface_depth(scene.gaussians, c)[0]) for c in scene.train]
         astray = outside_hidden_volume(file.gaussians.means[new], views)
         row |= {"outside": float(astray.mean()) if new.any() else 0.0, **scored(scene, folder / "render")}
         write_ply(folder / "unfilled.ply", file, ~new)
@@ -225,18 +226,26 @@ def round_the_object(scene: Scene, renders: Path) -> dict[str, float]:
 
 
 def outside_hidden_volume(
-    points: np.ndarray, views: Sequence[tuple[Camera, np.ndarray]], tolerance: int = TOLERANCE
+    points: np.ndarray,
+    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],
+    tolerance: int = TOLERANCE,
 ) -> np.ndarray:
-    """[N] bool: points [N, 3] that some view frames beside what the object hides there [H, W], or that no view does."""
+    """[N] bool: points [N, 3] that some view shows beside what the object hides there, or that no view does.
+
+    Views come with what the object hides [H, W] and z of what they show [H, W]: what lies behind another thing in one
+    is not seen there.
+    """
     framed, beside = np.zeros(len(points), bool), np.zeros(len(points), bool)
     kernel = np.ones((2 * tolerance + 1,) * 2, np.uint8)
-    for camera, mask in views:
+    for camera, mask, depth in views:
         hidden = cv2.dilate(mask.astype(np.uint8), kernel) > 0
         uv, z = camera.project(points.astype(np.float64))
-        within = (z > 0) & (uv >= 0).all(-1) & (uv < [camera.width, camera.height]).all(-1)
+        within = np.flatnonzero((z > 0) & (uv >= 0).all(-1) & (uv < [camera.width, camera.height]).all(-1))
         cols, rows = uv[within].astype(int).T
-        framed |= within
-        beside[within] |= ~hidden[rows, cols]
+        front = depth[rows, cols]
+        shown = hidden[rows, cols] | (front == 0) | (z[within] < (1 + SAME_DEPTH) * front)
+        framed[within] |= shown
+        beside[within] |= shown & ~hidden[rows, cols]
     return beside | ~framed
 
 

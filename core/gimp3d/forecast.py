@@ -11,6 +11,10 @@ from dataclasses import dataclass, field
 CHARTED = ("draft", "balanced", "best")  # presets that complete charts; others complete one view
 ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the former alone …
 ON_VIEWS = ("reference", "depth", "mapping")  # … and of the latter
+ORDER = (
+    "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "relearn", "reference", "depth", "appearance", "seed",
+    "mapping", "propagate", "settle", "refine", "verdict",
+)  # fmt: skip
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 STAGES = {
@@ -60,8 +64,10 @@ def forecast_removal(
     stages = {name: _sum(cost, work) for name, cost in STAGES.items() if name not in other}
     if steps := STEPS.get(preset, 0):
         stages["refine"] = steps * _sum(STEP if charted else PAPER_STEP, (1.0, pixels / 1e6 / max(1, views)))
+        if charted:
+            stages["relearn"] = stages["refine"]  # as many steps, over about as many pixels
     memory_mb = _sum(MEMORY_MB, (1.0, pixels / 1e6, gaussians / 1e6))
-    return Forecast(stages, memory_mb)
+    return Forecast({name: stages[name] for name in ORDER if name in stages}, memory_mb)
 
 
 def _sum(costs: tuple[float, ...], work: tuple[float, ...]) -> float:

@@ -30,7 +30,7 @@ def test_the_page_shows_every_picture_and_escapes_names(tmp_path: Path) -> None:
         "stages": [
             {"name": s.name, "seconds": s.seconds, "confidence": s.confidence, "reason": "<b>"} for s in result.stages
         ],
-        "counts": {"removed": 5, "added": 6},
+        "counts": {"removed": 5, "added": 6, "changed": 2},
         "verdict": asdict(result.verdict) | {"words": ["fair", "<u>enlarge</u>"], "haze": None},
         "settings": {"inpaint": "file:<x>"},
         "warnings": ["<script>alert(1)</script>"],

@@ -91,12 +91,17 @@ def test_a_ring_takes_what_the_frame_leaves_and_an_empty_mask_has_none() -> None
 
 
 def test_the_hidden_volume_holds_what_every_view_that_frames_it_hides() -> None:
-    views = [(c, silhouette(c)) for c in cameras(9)]
+    views = [(c, silhouette(c), np.zeros((c.height, c.width))) for c in cameras(9)]
     inside = [[0, 0, 0.02], [0.1, -0.1, BLOCK / 2]]
     beside = [[0.8, 0, 0], [0, 0, BLOCK + 0.6]]
     unframed = [[0, 0, 500.0], [1e4, 0, 0]]
     found = outside_hidden_volume(np.array([*inside, *beside, *unframed]), views)
     np.testing.assert_array_equal(found, [False] * 2 + [True] * 4)
+    # what stands before all that a view frames lets it tell nothing
+    wall = [(c, mask, np.full(mask.shape, 0.1)) for c, mask, _ in views]
+    found = outside_hidden_volume(np.array([*inside, beside[0]]), [(c, 0 & m, d) for c, m, d in wall[:4]] + views[4:])
+    np.testing.assert_array_equal(found, [False] * 2 + [True])
+    assert outside_hidden_volume(np.array(inside), [(c, 0 & m, d) for c, m, d in wall]).all()
 
 
 def test_tolerance_widens_the_hidden_volume_by_its_pixels() -> None:
@@ -104,8 +109,9 @@ def test_tolerance_widens_the_hidden_volume_by_its_pixels() -> None:
     mask = np.zeros((camera.height, camera.width), bool)
     mask[40:50, 50:60] = True
     points = camera.unproject(np.array([[54.5, 44.5], [64.5, 44.5], [65.5, 44.5]]), np.full(3, 2.0))
-    np.testing.assert_array_equal(outside_hidden_volume(points, [(camera, mask)], 5), [False, False, True])
-    np.testing.assert_array_equal(outside_hidden_volume(points, [(camera, mask)], 0), [False, True, True])
+    views = [(camera, mask, np.zeros(mask.shape))]
+    np.testing.assert_array_equal(outside_hidden_volume(points, views, 5), [False, False, True])
+    np.testing.assert_array_equal(outside_hidden_volume(points, views, 0), [False, True, True])
 
 
 def test_coverage_counts_pixels_of_all_views_and_leaves_a_marked_shadow_out_of_the_size(
