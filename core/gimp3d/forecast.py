@@ -12,8 +12,8 @@ CHARTED = ("draft", "balanced", "best")  # presets that complete charts; others 
 ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the former alone …
 ON_VIEWS = ("reference", "depth", "mapping")  # … and of the latter
 ORDER = (
-    "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "relearn", "reference", "depth", "appearance", "seed",
-    "mapping", "propagate", "settle", "refine", "verdict",
+    "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "relearn", "reference", "depth", "appearance",
+    "seed", "mapping", "propagate", "settle", "refine", "verdict",
 )  # fmt: skip
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view

@@ -1,7 +1,7 @@
-"""Motions that map a picture's surroundings of a hole onto themselves: lattices, rotations about a centre.
+"""Motions that map a picture's surroundings of a hole onto themselves: lattices, turns about a centre, reflections.
 
 What is regular is not invented: where a rigid motion of the picture explains nearly all of what is known round the
-hole, it also tells what is in it (offset statistics of He & Sun 2012, with rotations).
+hole, it also tells what is in it (offset statistics of He & Sun 2012, with rotations and reflections).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RIM, CONTRADICTED = 4, 0.01  # px beside the hole, and the share of them that ma
 class Motion:
     """The pixel p = (row, col) looks like the pixel `turn` @ p + `shift`."""
 
-    turn: np.ndarray  # [2, 2]
+    turn: np.ndarray  # [2, 2], a rotation or a reflection
     shift: np.ndarray  # [2] px
     explained: float  # share of the variance round the hole
     misfit: float  # RMS grey levels of what is not explained
@@ -51,15 +51,16 @@ def find_motions(
     band = _band(open_, there)
     if not open_.any() or not band.any() or _variance(small, band) < PLAIN:
         return ()
-    coarse = parallel_map(lambda angle: _of_angle(small, there, open_, band, angle), ANGLES)
+    turns = [(angle, mirrored) for mirrored in (False, True) for angle in ANGLES]
+    coarse = parallel_map(lambda turn: _of_turn(small, there, open_, band, *turn), turns)
     ratio = np.array([hole.shape[0] / size[1], hole.shape[1] / size[0]])
     picture, ring = image.astype(np.float32) / 255, _band(hole, known)
     found = []
-    for _, angle, shift in sorted((c for of_angle in coarse for c in of_angle), key=lambda c: c[0])[:TRIED]:
-        turn = _turn(angle)
+    for _, of, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
+        turn = _turn(*of)
         # centres of pixels lie at p + 1/2 in either resolution
         full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
-        found.append((angle, full))
+        found.append((*of, full))
     settled = parallel_map(lambda f: _settled(picture, known, hole, ring, *f), found)
     return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
 
@@ -84,9 +85,10 @@ def continue_regularly(
     return filled, hole & ~left
 
 
-def _turn(angle: float) -> np.ndarray:
+def _turn(angle: float, mirrored: bool) -> np.ndarray:
+    """[2, 2] a turn, or a reflection at an axis of half the angle."""
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-    return np.array([[c, -s], [s, c]])
+    return np.array([[c, s], [s, -c]] if mirrored else [[c, -s], [s, c]])
 
 
 def _band(hole: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -100,10 +102,10 @@ def _variance(image: np.ndarray, where: np.ndarray) -> float:
     return float(image[where].var(0).sum())
 
 
-def _of_angle(
-    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float
-) -> list[tuple[float, float, np.ndarray]]:
-    """(cost, angle, shift) of the translations after this turn under which the band is most like what it is mapped to.
+def _of_turn(
+    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float, mirrored: bool
+) -> list[tuple[float, tuple[float, bool], np.ndarray]]:
+    """(cost, turn, shift) of the translations after this turn under which the band is most like what it is mapped to.
 
     Sums of squared differences over what both sides know, for all translations at once (Fourier transforms).
     """
@@ -111,7 +113,7 @@ def _of_angle(
 
     h, w = hole.shape
     side = (h, w) if angle == 0 else (math.ceil(math.hypot(h, w)),) * 2
-    turn = _turn(angle)
+    turn = _turn(angle, mirrored)
     middle = np.array([h - 1, w - 1]) / 2 - turn @ (np.array(side) - 1) / 2  # turned pixel z shows turn @ z + middle
     matrix = np.array([[turn[1, 1], turn[1, 0], middle[1]], [turn[0, 1], turn[0, 0], middle[0]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -141,24 +143,30 @@ def _of_angle(
         if not score[v, u] < 0.5 * limit:  # pictures are settled finely later, and explain more then
             break
         moved = np.array([v - shape[0] if v >= side[0] else v, u - shape[1] if u >= side[1] else u])
-        found.append((float(score[v, u]), angle, turn @ moved + middle))
+        found.append((float(score[v, u]), (angle, mirrored), turn @ moved + middle))
         rows, cols = (np.arange(at - 2, at + 3) % n for at, n in zip((v, u), score.shape))
         score[np.ix_(rows, cols)] = np.inf
     return found
 
 
 def _settled(
-    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float, shift: np.ndarray
+    image: np.ndarray,
+    known: np.ndarray,
+    hole: np.ndarray,
+    band: np.ndarray,
+    angle: float,
+    mirrored: bool,
+    shift: np.ndarray,
 ) -> Motion | None:
     """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; it turns about the hole."""
     ring, inside = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000)))
     rim = np.nonzero(known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0))
     shows, total = known.astype(np.float32), 2 * _variance(image, band)
     middle = np.argwhere(hole).mean(0)
-    target = _turn(angle) @ middle + shift
+    target = _turn(angle, mirrored) @ middle + shift
 
     def at(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        turn = _turn(angle + values[0])
+        turn = _turn(angle + values[0], mirrored)
         return turn, target + values[1:] - turn @ middle
 
     def unexplained(values: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
@@ -174,7 +182,9 @@ def _settled(
     values, step = np.zeros(3), 1.0
     best = explained(values)
     while step > 0.1:
-        moves = [values + step * sign * np.eye(3)[k] for k in range(0 if angle else 1, 3) for sign in (1, -1)]
+        moves = [
+            values + step * sign * np.eye(3)[k] for k in range(0 if angle or mirrored else 1, 3) for sign in (1, -1)
+        ]
         told = [explained(m) for m in moves]
         if max(told) > best:
             values, best = moves[int(np.argmax(told))], max(told)

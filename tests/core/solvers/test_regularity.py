@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from structured import structured
@@ -32,6 +33,24 @@ def test_arms_of_a_flower_are_turned_into_place() -> None:
     truth, filled, regular = told("rug")
     assert 0.2 < regular.sum() / PICTURES["rug"][1].sum() < 1  # its middle is seen nowhere
     assert np.median(np.abs(filled[regular].astype(float) - truth[regular])) < 4
+
+
+@pytest.mark.parametrize("angle", [0.0, 33.0])
+def test_what_has_an_axis_is_reflected_at_it(angle: float) -> None:
+    half = np.random.default_rng(1).integers(0, 256, (130, 75, 3), dtype=np.uint8)
+    half = cv2.normalize(cv2.GaussianBlur(half.astype(np.float32), (0, 0), 5), None, 20, 235, cv2.NORM_MINMAX)
+    whole = np.concatenate([half, half[:, ::-1]], 1)
+    middle = whole.shape[1] / 2, whole.shape[0] / 2
+    matrix = cv2.getRotationMatrix2D(middle, angle, 1.0)
+    truth = cv2.warpAffine(whole, matrix, whole.shape[1::-1]).astype(np.uint8)
+    known = cv2.warpAffine(np.ones(whole.shape[:2], np.uint8), matrix, whole.shape[1::-1]) > 0
+    hole = np.zeros(known.shape, bool)
+    hole[45:80, 40:66] = True
+    motions = find_motions(np.where(hole[..., None], np.uint8(0), truth), hole, known & ~hole)
+    filled, regular = continue_regularly(truth, hole, known & ~hole, motions)
+    assert motions and np.linalg.det(motions[0].turn) < 0
+    assert regular.sum() > 0.9 * hole.sum()
+    assert np.abs(filled[regular].astype(float) - truth[regular]).mean() < 4
 
 
 @pytest.mark.parametrize("name", ["corner", "book row", "two mats and wood"])
