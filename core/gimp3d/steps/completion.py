@@ -92,7 +92,7 @@ def charts_to_paint(charts: Sequence[Chart], views: Sequence[ViewState]) -> tupl
 
 
 def texels_to_fill(chart: Chart, number: int, views: Sequence[ViewState]) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W] bool each: texels that views need, and those that are filled for that, as no photo shows them well."""
+    """[H, W] bool each: texels that views need, and those of them to fill: no photo shows them, or photos disagree."""
     marked = np.zeros(chart.hole.shape, np.uint8)
     for view in views:
         assert view.hits is not None
@@ -103,7 +103,7 @@ def texels_to_fill(chart: Chart, number: int, views: Sequence[ViewState]) -> tup
     closed = cv2.morphologyEx(marked, cv2.MORPH_CLOSE, kernel) > 0
     needed = (closed | (chart.hole & (cv2.dilate(marked, kernel) > 0))) & chart.there
     target = needed | (scipy.ndimage.binary_fill_holes(needed) & chart.hole)
-    return target, target & (chart.hole | (chart.photos == 0))
+    return target, target & ~chart.known
 
 
 def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
