@@ -165,7 +165,7 @@ def measured(scene: Scene, picture: str, switches: Sequence[Switch]) -> Row:
     except (BadInput, IllPosed) as error:
         return {"refused": str(error)}
     found = mean_psnrs(scene, filled(scene.gaussians, result), scene.test[1:])
-    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(result.added or ())}
+    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(result.new or ())}
 
 
 def changed(settings: RemovalSettings, switches: Sequence[Switch]) -> RemovalSettings:

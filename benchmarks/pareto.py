@@ -104,7 +104,7 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
     spent = seconds_of(watch)
     splats = filled(scene.gaussians, result)
     hole = next(int(v.target.sum()) for v in made["masks"].views if v.camera.id == made["reference"].camera_id)
-    added = len(result.added or ())
+    added = len(result.new or ())
     row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, hole)}
     row |= {"stages": {s.name: s.seconds for s in result.stages}}
     row |= spent | {"agreement": agreement(scene, splats, result)}

@@ -189,7 +189,8 @@ def speed(plan: Plan) -> Iterator[Row]:
         row = {"kind": kind, "n": n, "size": size, "threads": threads, **dict(zip(PHASES, map(cost, costs)))}
         if threads == 1:  # evaluations of a Gaussian at a pixel: 16 per block that an entry was blended into
             traced = trace(gaussians, view, passes=PASSES)[1]
-            row["lanes"] = LANES * count_blocks(traced.lists.starts, traced.ends, traced.masks)
+            masks, _, ends, _ = traced.kept
+            row["lanes"] = LANES * count_blocks(traced.lists.starts, ends, masks)
         say(f"{kind} {in_words(n)} {shown(size)} {threads} threads: {pair(row['forward'])} + {pair(row['backward'])}")
         yield row
 

@@ -159,7 +159,8 @@ def measured(scene: Scene, run: Run, folder: Path, reuse: bool) -> Row:
     summary = json.loads(summary_path.read_text())
     counts, cameras = summary["counts"], scene.folder / "transforms.json"
     row: Row = {"seconds": summary["seconds_total"], "score": (summary.get("verdict") or {}).get("score")}
-    row |= {key: counts[key] for key in ("removed", "added", "hole_pixels", "open_pixels")}
+    row |= {key: counts[key] for key in ("hole_pixels", "open_pixels")}
+    row |= {key: counts[key] - counts["changed"] for key in ("removed", "added")}
     drawn: Any = {"split": "test"} if scene.has_truth else {"frames": [c.id for c in shown(scene)]}
     render_views(out, cameras, folder / "render", **drawn)
     if scene.has_truth:

@@ -15,8 +15,8 @@ import numpy as np
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
-from gimp3d.gaussians import Gaussians
-from gimp3d.pipeline import PRESETS, View
+from gimp3d.gaussians import ARRAYS
+from gimp3d.pipeline import PRESETS, RemovalResult, View
 from gimp3d.run import unobserved
 
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
@@ -75,7 +75,7 @@ def measured(folder: Path, kind: str, level: float, preset: str) -> Row:
     row |= mean_psnrs(scene, filled(scene.gaussians, result), others)
     opened = mean_psnrs(scene, scene.gaussians.take(result.keep), others)
     row |= {f"open {name}": value for name, value in opened.items()}
-    return row | grown(result.added, scene.region) | {"warnings": list(result.warnings)}
+    return row | grown(result, scene.region) | {"warnings": list(result.warnings)}
 
 
 def perturbed_views(scene: Scene, reference: Camera, kind: str, level: float) -> list[View]:
@@ -94,14 +94,14 @@ def perturbed_views(scene: Scene, reference: Camera, kind: str, level: float) ->
     return [scene.drawn(c) for c in cameras]
 
 
-def grown(new: Gaussians | None, region: Region) -> Row:
-    """What was added: how many, whether all is finite, the largest splat and the farthest, in diagonals of the box."""
-    if not new:
+def grown(result: RemovalResult, region: Region) -> Row:
+    """What is new: how many, whether all is finite, the largest splat and the farthest, in diagonals of the box."""
+    new, added = result.new, result.added
+    if not new or not added:
         return {"added": 0, "finite": True, "largest": 0.0, "farthest": 0.0}
     corners = np.concatenate([box.corners() for box in region])
     centre, diagonal = corners.mean(0), float(np.linalg.norm(np.ptp(corners, axis=0)))
-    arrays = (new.means, new.log_scales, new.quats, new.opacity_logits, new.sh)
-    row = {"added": len(new), "finite": all(bool(np.isfinite(a).all()) for a in arrays)}
+    row = {"added": len(new), "finite": all(bool(np.isfinite(getattr(added, name)).all()) for name in ARRAYS)}
     farthest = float(np.linalg.norm(new.means - centre, axis=1).max())
     return row | {"largest": float(new.scales.max()) / diagonal, "farthest": farthest / diagonal}
 

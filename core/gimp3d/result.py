@@ -68,3 +68,8 @@ class RemovalResult:
     lifted: int = 0  # Gaussians that stay in another light
     changed: int = 0  # … or otherwise not as they were: removed, and the first of those added
     refined_views: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts; empty: nobody was asked
+
+    @property
+    def new(self) -> Gaussians | None:
+        """What is added and was not there before."""
+        return self.added and self.added.take(np.arange(self.changed, len(self.added)))

@@ -73,7 +73,8 @@ def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
         ply, cams, roi, picture = (str(scene / n) for n in ("scene.ply", "transforms.json", "roi.json", reference.id))
         target = str(out / "out.ply")
         job = RemovalJob(ply, cams, roi, target, reference=reference.id, reference_image=picture, preset=method)
-        added = run_removal(job)["counts"]["added"]
+        counts = run_removal(job)["counts"]
+        added = counts["added"] - counts["changed"]
     seconds = time.perf_counter() - start
     if method != "telea":
         render_views(out / "out.ply", scene / "transforms.json", out / "render", split="test")

@@ -110,7 +110,7 @@ def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
     """The chart with what completed references show of its hole: a picture that was given rules where it sees it."""
     points = chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(np.float64))
     for reference in done:
-        open_points = np.argwhere(chart.hole)
+        open_points = np.argwhere(~chart.known)
         if not len(open_points):
             break
         rows, cols = open_points.T

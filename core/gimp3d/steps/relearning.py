@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
-from ..stages.charts import Chart, pictured
+from ..stages.charts import Chart, extent, pictured
 from ..stages.refine import Observation, refine_gaussians
 from ..stages.selection import near_region
 from ..stages.witness import total_over
@@ -25,6 +25,7 @@ ROUND = 24  # px round the object in which photos teach
 PLACE, ELSEWHERE = 1, 2  # labels of a view's pixels: the object's place, and all others
 SHOWN = 2.0  # px of blend weight in the object's place, over all views, from which a Gaussian learns
 SHARE = 0.1  # of all its weight; what draws other places more than this one is left alone
+LARGEST = 0.5  # diagonals of the region, σ: giants of the background show in many places
 SMOOTHING = 1.0  # px, σ by which splats and charts are blurred before they are compared
 WRONG = 2.0  # times the charts' usual error beyond which what is drawn in the object's place is none of the surface
 
@@ -62,7 +63,7 @@ def relearn(
     """
     kept = scene.take(~removed)
     showing = [v for v in views if v.masks.silhouette.any()]
-    near = kept.usable & near_region(kept, region, 1.0)
+    near = kept.usable & near_region(kept, region, 1.0) & (kept.scales.max(1) < LARGEST * extent(region))
 
     def weights(view: ViewState) -> np.ndarray:
         labels = np.where(view.masks.silhouette, PLACE, ELSEWHERE).astype(np.uint8)
