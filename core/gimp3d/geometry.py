@@ -122,12 +122,14 @@ def dilated(mask: np.ndarray, margin: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
 
 
-def colours_at(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """[N, C] of the picture's type: bilinear samples at uv [N, 2]; beyond the frame its border goes on."""
+def colours_at(
+    picture: np.ndarray, uv: np.ndarray, how: int = cv2.INTER_LINEAR, beyond: int = cv2.BORDER_REPLICATE
+) -> np.ndarray:
+    """[N, ...] of the picture's type: samples at uv [N, 2], as cv2 names the way; by default its border goes on."""
     at = (uv.astype(np.float32) - np.float32(0.5))[:, None]
     parts = [at[k : k + MOST_ROWS] for k in range(0, len(at), MOST_ROWS)]
-    found = [cv2.remap(picture, p, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0] for p in parts]
-    return np.concatenate(found) if found else np.zeros((0, picture.shape[2]), picture.dtype)
+    found = [cv2.remap(picture, p, None, how, borderMode=beyond)[:, 0] for p in parts]
+    return np.concatenate(found) if found else np.zeros((0, *picture.shape[2:]), picture.dtype)
 
 
 def pack_camera(camera: Camera) -> np.ndarray:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
+from ..geometry import colours_at
 
 SIDE = 96  # px: pictures are shrunk to this to find motions in
 ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms
@@ -213,6 +214,4 @@ def _mapped(turn: np.ndarray, shift: np.ndarray, rows: np.ndarray, cols: np.ndar
 
 def _sample(picture: np.ndarray, y: np.ndarray, x: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
     """Values [N, ...] at places of a picture, 0 outside."""
-    if not len(y):
-        return np.zeros((0, *picture.shape[2:]), picture.dtype)
-    return cv2.remap(picture, x[None], y[None], how, borderMode=cv2.BORDER_CONSTANT)[0]
+    return colours_at(picture, np.stack([x, y], -1) + 0.5, how, cv2.BORDER_CONSTANT)

@@ -12,7 +12,7 @@ import scipy.ndimage
 
 from ..camera import Camera
 from ..errors import BadInput
-from ..geometry import disparity_of, sees
+from ..geometry import colours_at, disparity_of, sees
 from ..presets import RemovalSettings
 from ..priors.appearance import Appearance
 from ..priors.calls import Call
@@ -117,12 +117,11 @@ def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
         uv, _ = reference.camera.project(points[rows, cols])
         same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
         seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], same)
-        x, y = np.where(seen[:, None], uv, 0).astype(np.float32).T[:, :, None] - np.float32(0.5)
-        colours = cv2.remap(reference.image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
         photos = chart.photos.copy()
         shown = rows[seen], cols[seen]
-        image[shown], known[shown], hole[shown], photos[shown] = colours[seen], True, False, 1
+        image[shown] = colours_at(reference.image, uv[seen], cv2.INTER_CUBIC)
+        known[shown], hole[shown], photos[shown] = True, False, 1
         chart = replace(chart, image=image, known=known, hole=hole, photos=photos)
     return chart
 

@@ -72,3 +72,17 @@ def test_a_hole_without_surroundings_has_no_motions() -> None:
     picture = np.zeros((40, 50, 3), np.uint8)
     assert find_motions(picture, hole, ~hole) == ()
     assert not continue_regularly(picture, hole, ~hole, ())[1].any()
+
+
+def test_a_large_hole_is_told_as_well() -> None:
+    """cv2.remap refuses pictures of 32,768 rows or columns."""
+    rows, cols = np.mgrid[:300, :420]
+    truth = np.where(((rows // 20 + cols // 20) % 2)[..., None] == 0, np.uint8(60), np.uint8(200)).repeat(3, -1)
+    hole = np.zeros(rows.shape, bool)
+    hole[60:250, 110:300] = True
+    assert hole.sum() > 1 << 15
+    holed = np.where(hole[..., None], np.uint8(0), truth)
+    motions = find_motions(holed, hole, ~hole)
+    filled, regular = continue_regularly(holed, hole, ~hole, motions)
+    assert regular.sum() > 0.9 * hole.sum()
+    assert (np.abs(filled[regular].astype(int) - truth[regular]) < 30).mean() > 0.97
