@@ -230,7 +230,6 @@ def test_a_prior_guides_the_view_it_is_of_alone(remove: Remove, tmp_path: Path) 
 # Depth 0 / NaN / sky
 
 
-@pytest.mark.xfail(strict=True, reason="a chart's edge beside the hole is placed by the nearest texels: 32 dB")
 def test_a_floor_that_ends_beside_the_object_is_not_continued_into_the_void(remove: Remove) -> None:
     whole, true = (g.take(g.means[:, 0] > -0.4) for g in (scene(), truth()))
     assert_filled_on_the_floor(remove(whole), true)

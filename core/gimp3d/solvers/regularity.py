@@ -43,7 +43,10 @@ def find_motions(
     hole: np.ndarray,  # [H, W] bool
     known: np.ndarray,  # [H, W] bool, what the picture shows well
 ) -> tuple[Motion, ...]:
-    """The motions that explain what is round the hole, best first; none in most pictures."""
+    """The motions that explain what is round the hole, best first; none in most pictures.
+
+    Reflections are asked where nothing turns or repeats: what has both tells by either.
+    """
     scale = min(1.0, SIDE / max(hole.shape))
     size = (max(1, round(hole.shape[1] * scale)), max(1, round(hole.shape[0] * scale)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
@@ -52,18 +55,21 @@ def find_motions(
     band = _band(open_, there)
     if not open_.any() or not band.any() or _variance(small, band) < PLAIN:
         return ()
-    turns = [(angle, mirrored) for mirrored in (False, True) for angle in ANGLES]
-    coarse = parallel_map(lambda turn: _of_turn(small, there, open_, band, *turn), turns)
     ratio = np.array([hole.shape[0] / size[1], hole.shape[1] / size[0]])
     picture, ring = image.astype(np.float32) / 255, _band(hole, known)
-    found = []
-    for _, of, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
-        turn = _turn(*of)
-        # centres of pixels lie at p + 1/2 in either resolution
-        full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
-        found.append((*of, full))
-    settled = parallel_map(lambda f: _settled(picture, known, hole, ring, *f), found)
-    return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
+
+    def motions(mirrored: bool) -> tuple[Motion, ...]:
+        coarse = parallel_map(lambda angle: _of_turn(small, there, open_, band, angle, mirrored), ANGLES)
+        found = []
+        for _, angle, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
+            turn = _turn(angle, mirrored)
+            # centres of pixels lie at p + 1/2 in either resolution
+            full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
+            found.append((angle, mirrored, full))
+        settled = parallel_map(lambda f: _settled(picture, known, hole, ring, *f), found)
+        return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
+
+    return motions(mirrored=False) or motions(mirrored=True)
 
 
 def continue_regularly(
@@ -105,8 +111,8 @@ def _variance(image: np.ndarray, where: np.ndarray) -> float:
 
 def _of_turn(
     image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, angle: float, mirrored: bool
-) -> list[tuple[float, tuple[float, bool], np.ndarray]]:
-    """(cost, turn, shift) of the translations after this turn under which the band is most like what it is mapped to.
+) -> list[tuple[float, float, np.ndarray]]:
+    """(cost, angle, shift) of the translations after this turn under which the band is most like what it is mapped to.
 
     Sums of squared differences over what both sides know, for all translations at once (Fourier transforms).
     """
@@ -144,7 +150,7 @@ def _of_turn(
         if not score[v, u] < 0.5 * limit:  # pictures are settled finely later, and explain more then
             break
         moved = np.array([v - shape[0] if v >= side[0] else v, u - shape[1] if u >= side[1] else u])
-        found.append((float(score[v, u]), (angle, mirrored), turn @ moved + middle))
+        found.append((float(score[v, u]), angle, turn @ moved + middle))
         rows, cols = (np.arange(at - 2, at + 3) % n for at, n in zip((v, u), score.shape))
         score[np.ix_(rows, cols)] = np.inf
     return found
