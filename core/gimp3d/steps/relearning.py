@@ -14,7 +14,7 @@ from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
 from ..stages.charts import Chart, extent, pictured
-from ..stages.refine import Observation, refine_gaussians
+from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.selection import near_region
 from ..stages.witness import total_over
 from ..view_state import ViewState
@@ -62,8 +62,9 @@ def relearn(
     draws about what charts show, a photo of its own place knows better than a chart's mosaic.
     """
     kept = scene.take(~removed)
-    showing = [v for v in views if v.masks.silhouette.any()]
+    showing = looked_at([v for v in views if v.masks.silhouette.any()], settings.refine)
     near = kept.usable & near_region(kept, region, 1.0) & (kept.scales.max(1) < LARGEST * extent(region))
+    near &= np.isfinite(kept.opacity_logits)  # infinite ones are legal, and have no slope
 
     def weights(view: ViewState) -> np.ndarray:
         labels = np.where(view.masks.silhouette, PLACE, ELSEWHERE).astype(np.uint8)

@@ -79,6 +79,14 @@ def test_what_learned_counts_as_removed_and_added_and_comes_first() -> None:
     assert not any(tuple(m) in back for m in result.added.means[result.changed :])
 
 
+def test_what_is_opaque_to_infinity_stays_so() -> None:
+    odd = spoilt()
+    odd.opacity_logits[::2] = np.inf
+    result = remove_object(odd, views(), REGION, SETTINGS)
+    assert result.added is not None and result.changed > 0
+    assert all(np.isfinite(getattr(result.added, name)).all() for name in ARRAYS)
+
+
 def test_draft_leaves_what_stays_as_it_is() -> None:
     assert remove_object(spoilt(), views(), REGION, PRESETS["draft"]).changed == 0
 
