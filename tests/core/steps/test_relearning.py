@@ -110,6 +110,7 @@ def test_charts_teach_what_cannot_be_true() -> None:
     rows, cols = np.nonzero(place)
     patch = np.zeros_like(place)
     patch[rows[0] : rows[0] + 6, cols[0] - 6 : cols[0] + 6] = True
+    assert (patch & place).sum() > 5
     hazy = replace(view, painted=np.where(patch[..., None], [0, 0, 255], view.painted).astype(np.uint8))
     for seen, few in ((observed_round(view, behind().charts), True), (observed_round(hazy, behind().charts), False)):
         taught = seen.weight > 0
