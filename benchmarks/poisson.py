@@ -28,7 +28,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from gimp3d.compute.threads import set_thread_count
-from gimp3d.solvers.poisson import PoissonSettings, solve_poisson
+from gimp3d.solvers.poisson import solve_poisson
 
 from .command import parser_of, say, told_in_one_line, write_results
 from .photographs import blob
@@ -149,9 +149,8 @@ Solution = tuple[np.ndarray, int | None]  # x, iterations
 
 
 def ours(given: Problem, tolerance: float) -> Solution:
-    chosen = PoissonSettings(tolerance)
     soft = {"weight": given.weight, "anchor": given.anchor}
-    found = solve_poisson(given.hole, ~given.hole, given.values, settings=chosen, only_hole=True, **soft)
+    found = solve_poisson(given.hole, ~given.hole, given.values, tolerance=tolerance, only_hole=True, **soft)
     return found.values - given.level, found.iterations
 
 

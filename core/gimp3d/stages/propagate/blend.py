@@ -37,7 +37,7 @@ def blend_band(
     distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5)
     near = distance <= FAR * width
     whole = near & (painted | band | (depth > 0))  # the correction passes what lies between
-    domain = whole & ~_behind_seams(whole, depth)
+    domain = whole & ~_behind_seams(painted | band, depth)
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
     level = _levels(domain, data, mismatch, offset)

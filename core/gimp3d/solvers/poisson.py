@@ -1,0 +1,276 @@
+"""Poisson's equation on the pixels of an irregular hole, by conjugate gradients and a multigrid cycle.
+
+A cell of a coarser grid stands for 2×2 finer ones, and links to its neighbours by the sum of the links that cross
+their border: so every grid is a graph of four neighbours, and one relaxation serves all. A correction that is constant
+in each cell climbs in steps, which costs twice the energy of a slope; halved links make up for that (Braess 1995).
+Times beside other solvers: `make bench-poisson`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..compute.jit import exact_kernel
+from ..geometry import bounds
+
+LEAST_WEIGHT, MOST_WEIGHT = 1e-30, 1e30  # weaker ones do not count, stronger ones count as this
+STEPS = 0.5  # by which links of a coarser grid count
+MOST_ITERATIONS = 5000  # 10 are usual, hundreds are taken by mazes of one-pixel walls
+AXES = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))  # pixels and their neighbours to the right, and below
+
+
+@dataclass(frozen=True)
+class PoissonSolution:
+    """A filled array, or only the M pixels of the hole, in the order of array[hole]."""
+
+    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced; or [M] or [M, C]
+    iterations: int  # most of any channel
+    unanchored: np.ndarray  # [H, W] or [M] bool, hole pixels of components that touch no known pixel
+
+
+def solve_poisson(
+    hole: np.ndarray,  # [H, W] bool, unknown pixels
+    known: np.ndarray,  # [H, W] bool, Dirichlet pixels; only those beside the hole matter
+    values: np.ndarray,  # [H, W] or [H, W, C], fixed where known
+    guidance: np.ndarray | None = None,  # like values: its 4-neighbour differences are the wanted gradients
+    tolerance: float = 1e-5,  # residual over that of the guidance plus one constant per component, over the diagonal
+    *,
+    weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor` (or to 0)
+    anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
+    only_hole: bool = False,  # for large images with small holes: nothing else is made and returned
+) -> PoissonSolution:
+    """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
+
+    This is paper 3.3 with its sign mended (docs/method.md): the solution's gradients are the guidance's, not their
+    opposites. Neighbours that are neither hole nor known, and the image's border, are natural (Neumann): they are
+    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels that are
+    not finite are not known; weights and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the
+    most.
+
+    A component of the hole that touches no known pixel (and is drawn to no anchor) is reported as unanchored. It takes
+    the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
+    """
+    hole = np.asarray(hole, bool)
+    if not hole.any():
+        filled = np.array(values, dtype=np.float64)
+        return PoissonSolution(filled[hole] if only_hole else filled, 0, np.zeros(0 if only_hole else hole.shape, bool))
+    window = bounds(hole, 1)
+
+    def cut(array: np.ndarray) -> np.ndarray:
+        part = np.pad(np.asarray(array)[window], ((1, 1), (1, 1), *[(0, 0)] * (np.ndim(array) - 2)))
+        return part if part.dtype == bool else part.astype(np.float64).reshape(*part.shape[:2], -1)
+
+    fixed, guide = cut(values), None if guidance is None else cut(guidance)
+    aim = np.zeros(fixed.shape) if anchor is None else cut(anchor)
+    pull = np.zeros(fixed.shape[:2]) if weight is None else cut(weight)[..., 0]
+    pull[~((pull > LEAST_WEIGHT) & np.isfinite(pull) & np.isfinite(aim).all(-1))] = 0
+    aim[pull == 0] = 0
+    task = _Task(cut(hole), cut(np.asarray(known, bool)), fixed, guide, np.minimum(pull, MOST_WEIGHT), aim)
+    found, iterations, loose = _solve(task, tolerance)
+    inside, loose = found[task.hole].reshape(-1, *np.shape(values)[2:]), loose[task.hole]
+    if only_hole:
+        return PoissonSolution(inside, iterations, loose)
+    filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
+    filled[hole], unanchored[hole] = inside, loose
+    return PoissonSolution(filled, iterations, unanchored)
+
+
+class _Task(NamedTuple):
+    """What is given, in the window and an empty border; pull is 0 where there is no anchor."""
+
+    hole: np.ndarray  # [h, w] bool
+    known: np.ndarray  # [h, w] bool
+    values: np.ndarray  # [h, w, C]
+    guidance: np.ndarray | None  # [h, w, C]
+    pull: np.ndarray  # [h, w]
+    anchor: np.ndarray  # [h, w, C]
+
+
+def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
+    """[h, w, C] of the hole, the iterations taken, and what is unanchored [h, w] bool."""
+    hole, known = task.hole, task.known & ~task.hole & np.isfinite(task.values).all(-1)
+    given = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
+    guided, values = np.isfinite(given), np.where(known[..., None], task.values, 0)
+    # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for.
+    start = np.where(guided & hole[..., None], given, 0)
+    tie, amount = np.where(hole, task.pull, 0), np.zeros(start.shape)
+    amount[hole] = task.pull[hole, None] * (task.anchor - start)[hole]
+    flat = np.zeros(start.shape)  # pairs of which one has no guidance want no gradient, not the start's
+    links = []
+    for a, b in AXES:
+        linked, wanted = hole[a] & hole[b], guided[a] & guided[b]
+        links.append(np.zeros(hole.shape))
+        links[-1][a] = linked
+        for p, q in ((a, b), (b, a)):
+            tied = hole[p] & known[q]
+            tie[p] += tied
+            beyond = values[q] - np.where(wanted, given[q], start[p])
+            amount[p] += np.where(tied[..., None], beyond, 0)
+            flat[p] += np.where(linked[..., None] & ~wanted, start[q] - start[p], 0)
+    count, parts = cv2.connectedComponents(hole.astype(np.uint8), connectivity=4)
+    strength = np.bincount(parts.ravel(), tie.ravel(), count)
+    loose = hole & (strength == 0)[parts]
+    if loose.any():
+        return _settled(task, loose, parts, tolerance)
+    strength[0] = 1
+
+    def mean(of_ties: np.ndarray) -> np.ndarray:
+        """[h, w]: a part's value that balances its ties."""
+        return (np.bincount(parts.ravel(), of_ties.ravel(), count) / strength)[parts]
+
+    grids = _grids(tie, *links)
+    result, most = start, 0
+    for c in range(start.shape[2]):
+        shift = mean(amount[..., c])
+        found, iterations = _iterated(grids, amount[..., c] - tie * shift + flat[..., c], tolerance)
+        # Right-hand sides add up to zero in each part. So do ties times the solution, on however few or weak ties.
+        result[..., c] += np.where(hole, shift + found - mean(tie * found), 0)
+        most = max(most, iterations)
+    return result, most, loose
+
+
+def _settled(task: _Task, loose: np.ndarray, parts: np.ndarray, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
+    """Unanchored parts take their guidance, the rest is solved; pixels without guidance hang on those with."""
+    guidance = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
+    taken = loose & np.isfinite(guidance).all(-1)
+    lost = loose & (np.bincount(parts.ravel(), taken.ravel()) == 0)[parts]
+    values = np.where(taken[..., None], guidance, task.values)
+    hole, known = task.hole & ~taken & ~lost, (task.known & ~loose) | taken
+    result, iterations, _ = _solve(task._replace(hole=hole, known=known, values=values), tolerance)
+    return np.where(taken[..., None], guidance, np.where(lost[..., None], np.nan, result)), iterations, loose
+
+
+class _Grid(NamedTuple):
+    """A graph of four neighbours, [h, w] each, with a border of empty cells."""
+
+    diagonal: np.ndarray  # sum of a cell's links and ties; 0 outside the hole
+    right: np.ndarray  # links to the next column
+    down: np.ndarray  # links to the next row
+
+
+def _grids(tie: np.ndarray, right: np.ndarray, down: np.ndarray) -> list[_Grid]:
+    """From fine to coarse, down to a single cell."""
+    grids: list[_Grid] = []
+    while not grids or max(tie.shape) > 3:
+        if grids:
+            crossing = right.copy(), down.copy()
+            crossing[0][:, 1::2], crossing[1][1::2] = 0, 0
+            tie, right, down = _by_four(tie), *(STEPS * _by_four(links) for links in crossing)
+        diagonal = tie + right + down
+        diagonal[:, 1:] += right[:, :-1]
+        diagonal[1:] += down[:-1]
+        grids.append(_Grid(diagonal, right, down))
+    return grids
+
+
+def _by_four(cells: np.ndarray) -> np.ndarray:
+    """Sums over 2×2 cells."""
+    h, w = cells.shape
+    padded = np.pad(cells[1:-1, 1:-1], ((2, 2 + h % 2), (2, 2 + w % 2)))
+    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]
+
+
+def _iterated(grids: Sequence[_Grid], right_side: np.ndarray, tolerance: float) -> tuple[np.ndarray, int]:
+    """Conjugate gradients, preconditioned by a cycle (Tatebe 1993), and how many steps they took."""
+    found, left = np.zeros_like(right_side), right_side.copy()
+    direction, product, before = np.zeros_like(left), np.zeros_like(left), 1.0
+    error = _advance(0.0, direction, product, grids[0].diagonal, found, left)
+    wanted = tolerance**2 * error
+    for iteration in range(MOST_ITERATIONS):
+        if error <= wanted:
+            return found, iteration
+        correction = _cycle(grids, left)
+        now = float((left * correction).sum())
+        direction *= now / before
+        direction += correction
+        energy = _times(direction, *grids[0], product)
+        if not energy > 0:  # there is nothing left that float64 can tell
+            return found, iteration
+        error, before = _advance(now / energy, direction, product, grids[0].diagonal, found, left), now
+    return found, MOST_ITERATIONS
+
+
+def _cycle(grids: Sequence[_Grid], right_side: np.ndarray) -> np.ndarray:
+    """About the solution for a right-hand side: red-black relaxation down to the coarsest grid and up again."""
+    sides, found = [right_side], []
+    for grid in grids:
+        h, w = grid.diagonal.shape
+        found.append(np.zeros((h, w)))
+        sides.append(np.zeros((h // 2 + 1 + h % 2, w // 2 + 1 + w % 2)))
+        _descend(sides[-2], *grid, found[-1], sides[-1])
+    for k in range(len(grids) - 1)[::-1]:
+        _ascend(sides[k], *grids[k], found[k + 1], found[k])
+    return found[0]
+
+
+# What comes from a cell's neighbours is written out each time: a helper that takes arrays would count references.
+
+
+@exact_kernel
+def _descend(side, diagonal, right, down, u, coarser):
+    """u ← relaxed from 0, red cells first; coarser += what is left then, which is nothing on black cells."""
+    h, w = u.shape
+    for i in range(1, h - 1):
+        for j in range(1 + (i & 1), w - 1, 2):
+            if diagonal[i, j] > 0:
+                u[i, j] = side[i, j] / diagonal[i, j]
+    for i in range(1, h - 1):
+        for j in range(2 - (i & 1), w - 1, 2):
+            if diagonal[i, j] > 0:
+                around = right[i, j - 1] * u[i, j - 1] + right[i, j] * u[i, j + 1]
+                around += down[i - 1, j] * u[i - 1, j] + down[i, j] * u[i + 1, j]
+                u[i, j] = (side[i, j] + around) / diagonal[i, j]
+    for i in range(1, h - 1):
+        for j in range(1 + (i & 1), w - 1, 2):
+            if diagonal[i, j] > 0:
+                around = right[i, j - 1] * u[i, j - 1] + right[i, j] * u[i, j + 1]
+                around += down[i - 1, j] * u[i - 1, j] + down[i, j] * u[i + 1, j]
+                coarser[(i + 1) // 2, (j + 1) // 2] += around
+
+
+@exact_kernel
+def _ascend(side, diagonal, right, down, coarser, u):
+    """u ← with the coarser correction, relaxed, black cells first, which need no correction of their own for that."""
+    h, w = u.shape
+    for i in range(1, h - 1):
+        for j in range(1 + (i & 1), w - 1, 2):
+            if diagonal[i, j] > 0:
+                u[i, j] += coarser[(i + 1) // 2, (j + 1) // 2]
+    for colour in range(2):
+        for i in range(1, h - 1):
+            for j in range(1 + ((i + 1 + colour) & 1), w - 1, 2):
+                if diagonal[i, j] > 0:
+                    around = right[i, j - 1] * u[i, j - 1] + right[i, j] * u[i, j + 1]
+                    around += down[i - 1, j] * u[i - 1, j] + down[i, j] * u[i + 1, j]
+                    u[i, j] = (side[i, j] + around) / diagonal[i, j]
+
+
+@exact_kernel
+def _times(u, diagonal, right, down, out):
+    """out ← A·u; u·A·u."""
+    energy = 0.0
+    for i in range(1, u.shape[0] - 1):
+        for j in range(1, u.shape[1] - 1):
+            around = right[i, j - 1] * u[i, j - 1] + right[i, j] * u[i, j + 1]
+            around += down[i - 1, j] * u[i - 1, j] + down[i, j] * u[i + 1, j]
+            out[i, j] = diagonal[i, j] * u[i, j] - around
+            energy += u[i, j] * out[i, j]
+    return energy
+
+
+@exact_kernel
+def _advance(step, direction, product, diagonal, found, left):
+    """found += step · direction, left −= step · product; the square of what is left over the diagonal."""
+    total = 0.0
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            if diagonal[i, j] > 0:
+                found[i, j] += step * direction[i, j]
+                left[i, j] -= step * product[i, j]
+                total += (left[i, j] / diagonal[i, j]) ** 2
+    return total
