@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 DATA ?= ../shared/data/withwithout
 READY := $(VENV)/.ready
 
-.PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-surface bench-poisson bench-depth \
+.PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-poisson \
 	bench-ablation bench-propagate bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
 	bench-large bench-real bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
 .DELETE_ON_ERROR:
@@ -54,20 +54,14 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: bench-raster bench-surface bench-poisson bench-depth bench-inpaint bench-pareto bench-stability
+bench: bench-raster bench-poisson bench-inpaint bench-pareto bench-stability
 	$(BIN)/gimp3d bench $(DATA) --scenes desk,corner,gloss,rocks --presets draft,balanced,best --out build/bench
 
 bench-raster: $(READY)
 	$(BIN)/python -m benchmarks.raster
 
-bench-surface: $(READY)
-	$(BIN)/python -m benchmarks.surface $(DATA)
-
 bench-poisson: $(READY)
 	$(BIN)/python -m benchmarks.poisson
-
-bench-depth: $(READY)
-	$(BIN)/python -m benchmarks.depth $(DATA)
 
 # each rule of a removal switched off in turn: hours, so not part of bench; goes on where it stopped
 bench-ablation: $(READY)

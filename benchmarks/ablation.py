@@ -50,12 +50,9 @@ ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
 BY_PLACE_ALONE = Around(lambda besides: lambda surface, bent: besides(surface, bent)[:, : 5 if bent else 2])
 RULES: dict[str, tuple[Switch, ...]] = {
     # what is object, where is filled, from which surface
-    "no charts: photos are the only references": (("charts", None),),
-    "photos copy nothing of the hidden surface": (("use_evidence", False),),
     "no further references": (("extra_references", 0),),
-    "targets as the paper's": (("masks.mode", "paper"), ("charts", None)),
+    "no charts: targets and references as the paper's": (("masks.mode", "paper"), ("charts", None)),
     "what has its centre in the box is the object": (("masks.selection.by_centre", True),),
-    "a membrane behind the object": (("depth.surface", "harmonic"),),
     "smears that only the removal reveals stay": (("masks.selection.support", 0.0),),
     "planes are settled all round the object": (
         ("gimp3d.stages.charts.find:OWN", 10**9),

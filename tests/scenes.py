@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gimp3d.box import Box
+from gimp3d.behind import Behind, look_behind
+from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
+from gimp3d.presets import PRESETS, RemovalSettings
+from gimp3d.raster import render_bytes
+from gimp3d.run import Run
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, lay_planes
-from gimp3d.stages.masks import ViewMasks
+from gimp3d.stages.masks import ViewMasks, find_masks
 from gimp3d.stages.witness import Witness
 
 BLOCK = 0.5  # side of the block, scene units
@@ -92,3 +96,17 @@ def charts_of(
 ) -> tuple[Chart, ...]:
     """What photos show at planes round the block."""
     return draw_charts(lay_planes(planes, views, witnesses, REGION, settings), witnesses, REGION, marked)
+
+
+def charted(
+    gaussians: Gaussians,
+    region: Region,
+    views: Sequence[Camera],
+    photos: Mapping[str, np.ndarray] | None = None,  # ID → picture; None: as drawn
+    extra: Mapping[str, np.ndarray] | None = None,  # see find_masks
+    settings: RemovalSettings = PRESETS["draft"],
+) -> Behind:
+    """What a removal knows of what is behind the object, T of every view for one."""
+    photos = {c.id: render_bytes(gaussians, c) for c in views} if photos is None else photos
+    masks = find_masks(gaussians, region, views, settings.masks, photos=photos, extra=extra)
+    return look_behind(Run(settings), gaussians, region, masks, photos, {})

@@ -19,8 +19,9 @@ from .steps.relearning import relearn
 from .steps.surfaces import Charted, chart_surfaces, find_surfaces
 from .view_state import ViewState
 
-LIGHT = ("light", "lift", "contact", "lift 2", "charts 2")  # stages that a removal with --shadow off lacks
-BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "relearn")  # stages that know nothing of fills
+LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
+# stages that know nothing of fills
+BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "surfaces 2", "charts 3", "relearn")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ def look_behind(
     views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views))
     if settings.charts is None or masks.mode != "need":
         return Behind(scene, scene, lit.rows, masks, views, (), lit)
-    surfaces = run("surfaces", find_surfaces, scene, region, masks, views, settings)
+    inputs = scene, region, masks, views, settings
+    surfaces = run("surfaces", find_surfaces, *inputs)
     masks = replace(masks, selection=surfaces.selection)
 
     def in_light(found: Found | None, suffix: str = "") -> tuple[Relit, Charted]:
@@ -72,6 +74,10 @@ def look_behind(
     if found is not None and found.shadow is None and settings.shadow == "auto":
         found = run("contact", with_contact, found, charted.charts)
         lit, charted = in_light(found, " 2") if found.shadow is not None else (Relit.of(found, lit.lifted), charted)
+    if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
+        surfaces = run("surfaces 2", find_surfaces, *inputs, False)
+        masks = replace(masks, selection=surfaces.selection)
+        lit, charted = in_light(found, " 3")
     run.pictures += pictures.of_light(lit, [v.id for v in views])
     scene, views = lit.scene(scene), lit.views(views)
     if charted.charts:
@@ -80,7 +86,7 @@ def look_behind(
         views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
     if not settings.refine.steps:
         return Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
-    inputs = scene, region, masks.removed, views, charted.charts, settings, run.progress
-    learned = run("relearn", relearn, *inputs)
+    given = scene, region, masks.removed, views, charted.charts, settings, run.progress
+    learned = run("relearn", relearn, *given)
     changed = np.union1d(lit.rows, learned.rows)
     return Behind(scene, learned.scene(scene), changed, masks, views, charted.charts, lit)

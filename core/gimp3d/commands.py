@@ -239,7 +239,7 @@ def write_masks(
         target = view.masks.target if view else np.zeros((camera.height, camera.width), bool)
         write_png(out / f"{name}.png", target)
         if pictures and view:
-            shown = preview(view, list(views.values()), settings)
+            shown = preview(view, settings)
             for looked in (*shown, *of_light(lit, list(views), [camera.id])):
                 write_png(pictures / f"{name}.{looked.kind}.png", draw(looked))
 

@@ -32,6 +32,7 @@ from .steps.completion import (
     Turn,
     carried_over,
     complete_view_depth,
+    left_to_charts,
     paint_chart,
     paint_view,
     texels_to_fill,
@@ -72,13 +73,10 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
         try:
             if turn.chart is None:
                 completed = _complete_view(run, filling, charts, turn, suffix)
-            elif (of_chart := _complete_chart(run, filling, charts[turn.chart], turn, suffix)) is not None:
-                completed = of_chart
             else:
-                if turn.name:
-                    run.warnings.append(f"--reference {turn.name}: no view needs this chart, it is not used")
-                continue
-            filling = _carry(run, filling, completed, suffix)
+                completed = _complete_chart(run, filling, charts[turn.chart], turn, suffix)
+            if completed is not None:
+                filling = _carry(run, filling, completed, suffix)
         except IllPosed as error:
             if not number and hole > NEGLIGIBLE * touched:
                 raise
@@ -93,6 +91,8 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
     chart = carried_over(chart, filling.done)
     target, hole = texels_to_fill(chart, turn.chart, filling.views)
     if not target.any():
+        if turn.name:
+            run.warnings.append(f"--reference {turn.name}: no view needs this chart, it is not used")
         return None
     name = f"appearance{suffix}"
     appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
@@ -100,23 +100,25 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
     return Completed(chart.camera, appearance, chart.depth, target, ~target & ~hole & chart.known, (chart,))
 
 
-def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed:
-    """One view without the object; the program chooses it unless the user named one."""
+def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
+    """One view without the object, which the program chooses unless the user did; None if charts are filled for it."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
     masks = [v.left for v in views]
     choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
     run.references.append(choice)
+    if turn.name and left_to_charts(charts, turn, settings):
+        return None
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix
     calls = run.call("--inpaint", name), run.call("--depth-prior", name)
-    completion = run(name, complete_view_depth, view, views, settings, turn.picture, first, *calls)
+    completion = run(name, complete_view_depth, view, settings, turn.picture, first, *calls)
     depth = np.where(view.left.target, completion.depth, view.left.depth_after).astype(np.float32)
     # Where drawn surfaces scatter about the charts by more than a z-test allows, the charts tell the depth.
     rough = any(c.scatter > SAME_DEPTH for c in charts)
     if rough and view.hits is not None:
         depth = snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
     name = f"appearance{suffix}"
-    appearance = run(name, paint_view, view, depth, views, settings, turn.picture, run.call("--inpaint", name))
+    appearance = run(name, paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
     run.warnings += appearance.warnings
     run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
     source = ~view.left.target & ~view.left.silhouette & (depth > 0)
@@ -141,7 +143,7 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     shown = [with_own_picture(p, completed) for p in painting.views]
     added = new if filling.added is None else filling.added.extended(new)
     reference, filled = as_reference(completed), filling.kept.extended(added)
-    views = after_reference(views, shown, reference, filled, new, len(added), settings.masks)
+    views = after_reference(views, shown, reference, filled, new, len(added))
     return replace(filling, views=views, added=added, done=(*filling.done, reference))
 
 

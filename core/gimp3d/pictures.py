@@ -77,8 +77,8 @@ def of_depth(
 ) -> list[Picture]:
     """The completed surface, and how the depth prior was scaled, if there was one."""
     shown = [Picture("depth", f"Completed surface in {name}", image, (depth, target))]
-    if len(completion.ring):
-        data = (completion.ring, np.array(completion.line), np.array([completion.scale_factor]))
+    if len(completion.fit.ring):
+        data = (completion.fit.ring, np.array(completion.fit.line), np.array([completion.fit.scale]))
         shown.append(Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data))
     return shown
 

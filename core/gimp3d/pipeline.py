@@ -127,8 +127,12 @@ def _remove(
         filling = fill_hole(run, filling, behind.charts, turns)
         filling = refine(run, ask_for_refinement(run, filling))
     else:
-        covers = "what surrounds the box covers its outline in every view" if masks.mode == "paper" else None
-        run.warnings.append(f"nothing to fill: {covers or 'every view sees what is behind the object'}")
+        why = "every view sees what is behind the object"
+        if masks.mode == "paper":
+            why = "what surrounds the box covers its outline in every view"
+        elif not behind.charts:
+            why = "no surface is found of which the object hides something from every view"
+        run.warnings.append(f"nothing to fill: {why}")
     if (left := open_pixels(filling.views)) > settings.extra_gain * masks.hole_pixels:
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
@@ -154,7 +158,10 @@ def _find_object(
     for camera in cameras:
         if camera.width < 1 or camera.height < 1:
             raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
-    masks = run("masks", find_masks, scene, region, cameras, run.settings.masks, run.progress, photos, extra)
+    settings = run.settings.masks
+    if run.settings.charts is None:  # nothing else tells T then
+        settings = replace(settings, mode="paper")
+    masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra)
     run.warnings += masks.warnings
     if masks.removed.any() and masks.left_out:
         run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
@@ -246,14 +253,14 @@ def _result(run: Run, masks: Masks, lit: Relit, painted: dict[str, np.ndarray]) 
     )
 
 
-def preview(view: ViewState, views: Sequence[ViewState], settings: RemovalSettings) -> list[Picture]:
+def preview(view: ViewState, settings: RemovalSettings) -> list[Picture]:
     """What a removal would do in a view: where it would fill, on what surface, and how a depth prior was scaled."""
     target, run = view.left.target, Run(settings)
     shown = pictures.of_targets([view])
     if target.any():
         calls = run.call("--inpaint", "depth"), run.call("--depth-prior", "depth")
         try:
-            completed = complete_view_depth(view, views, settings, None, True, *calls)
+            completed = complete_view_depth(view, settings, None, True, *calls)
         except IllPosed:
             return shown  # the region is worth seeing all the more
         depth = np.where(target, completed.depth, view.left.depth_after).astype(np.float32)

@@ -32,7 +32,6 @@ class RemovalSettings:
     inpaint: str = "exemplar"  # provider; who paints what no photo shows
     depth_prior: str = "auto"  # provider; where the depth behind the object comes from
     shadow: Literal["auto", "off", "mask"] = "auto"  # look for the object's shadow, leave it, or undo the marked one
-    use_evidence: bool = True  # copy what photos show of the hidden surface before the rest is invented
     extra_references: int = 3  # views; completed after the first one, where it does not reach
     extra_gain: Share = 0.01  # share of the hole; that must still be open for an extra reference
     random_seed: Seed = 0  # number; another one gives another texture
@@ -49,12 +48,11 @@ PRESETS: dict[str, RemovalSettings] = {
     "paper": RemovalSettings(
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
-        depth=DepthSettings(scale_factor=0.1, surface="harmonic", layer_step=1e9),
+        depth=DepthSettings(surface="harmonic", scale_factor=0.1),
         propagate=PropagateSettings(transfer="sample", blend="rim"),
         seed=SeedSettings(largest=1, corrections=0, sh_degree=3),
         refine=RefineSettings(steps=3000, patience=120),
         shadow="off",
-        use_evidence=False,
         extra_references=0,
     ),
 }

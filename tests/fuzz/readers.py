@@ -130,7 +130,7 @@ COMFY = {
 AUTOMATIC = {"img2img": {"images": ["data:image/png;base64,AAAA"]}, "progress": {"progress": 0.5}}
 REFUSED = {"error": {"message": "m", "details": "d"}, "detail": "d", "errors": "e",
            "node_errors": {"1": {"class_type": "c", "errors": [{"message": "m", "details": "d"}]}}}  # fmt: skip
-SETTINGS = {"masks.margin": "2", "seed.opacity": "0.9", "refine.steps": "0", "depth.scale_factor": "none"}
+SETTINGS = {"extra_references": "2", "seed.opacity": "0.9", "refine.steps": "0", "depth.scale_factor": "none"}
 
 
 def read_json_cameras(data: bytes) -> object:

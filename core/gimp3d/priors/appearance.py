@@ -30,8 +30,6 @@ class Unfinished:
     image: np.ndarray  # [H, W, 3] uint8; what stands in the hole means nothing
     hole: np.ndarray  # [H, W] bool, not empty
     seed: int = 0  # the same seed gives the same fill
-    disparity: np.ndarray | None = None  # [H, W] float32, 1/z of the surface, in the hole too; 0 = infinity or nothing
-    K: np.ndarray | None = None  # [3, 3], known with the disparity
     unknown: np.ndarray | None = None  # [H, W] bool, pixels that mean nothing either, but are not to be filled
     variant: int = 0  # another fill of the same hole, for people to choose from
 

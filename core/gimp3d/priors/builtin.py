@@ -11,7 +11,6 @@ import numpy as np
 from ..errors import BadInput
 from ..solvers.exemplar import ExemplarSettings, complete_picture
 from ..solvers.patchmatch import nearest_allowed
-from ..solvers.surface import tangent_planes
 from .appearance import Appearance, Provider, Unfinished, window_round_hole
 
 SPECK = 4  # px; smaller parts of a hole are interpolated
@@ -36,20 +35,15 @@ def without_specks(provider: Provider, view: Unfinished) -> Appearance:
 def exemplar(view: Unfinished) -> Appearance:
     """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
     near = window_round_hole(view.hole)
-    surface = None
-    if view.disparity is not None and view.K is not None:
-        corner = np.array([[0, 0, near[1].start], [0, 0, near[0].start], [0, 0, 0]])
-        surface = tangent_planes(view.disparity[near], view.K - corner)
     unknown = None if view.unknown is None else view.unknown[near]
     settings = ExemplarSettings(PATCHES[view.variant % len(PATCHES)], seed=view.seed + view.variant)
-    done = complete_picture(view.image[near], view.hole[near], settings, surface, unknown)
+    done = complete_picture(view.image[near], view.hole[near], settings, unknown)
     if np.isnan(done.misfit):
         return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
     whole = view.image.copy()
     whole[near] = done.image
-    how = "" if surface is None else ", laid along its surfaces"
-    words = f"filled with the view's own texture{how}, which fits to {done.misfit:.1f} grey levels"
+    words = f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels"
     return Appearance(whole, confidence, words)
 
 

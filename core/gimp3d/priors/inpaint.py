@@ -41,15 +41,11 @@ def inpaint_reference(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool
     seed: int = 0,
-    disparity: np.ndarray | None = None,  # [H, W] float32, of the completed surface; None: not known
-    K: np.ndarray | None = None,  # [3, 3]
     unknown: np.ndarray | None = None,  # [H, W] bool, see Unfinished
     call: Call = Call(),
     variant: int = 0,
 ) -> Appearance:
     """Fill the hole by the provider that `spec` names.
-
-    The surface guides `exemplar`: textures are copied along it, so that they shrink with distance.
 
     Raises
     ------
@@ -63,7 +59,7 @@ def inpaint_reference(
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
     if hole.all() and not spec.startswith("file:"):
         raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
-    filled = provider(Unfinished(image, hole, seed, disparity, K, unknown, variant))
+    filled = provider(Unfinished(image, hole, seed, unknown, variant))
     return replace(filled, image=np.where(hole[..., None], filled.image, image))
 
 

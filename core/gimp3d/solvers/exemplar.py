@@ -19,7 +19,6 @@ from .greedy import fill_inwards
 from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import (
-    REACH,
     NearestNeighbourField,
     PatchMatchSettings,
     nearest_allowed,
@@ -30,7 +29,6 @@ from .patchmatch import (
 from .poisson import solve_poisson
 from .regularity import continue_regularly, find_motions
 from .shift_map import shift_map
-from .surface import TangentPlanes, coarser, supports, warps, whole_patches
 
 VOTE_PIXELS = 1024  # per piece of work
 COPIED = 0.5  # of the filled picture's gradients is as copied, the rest as patches vote: more is sharper, and noisier
@@ -73,7 +71,6 @@ def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
     settings: ExemplarSettings = ExemplarSettings(),
-    surface: TangentPlanes | None = None,  # what the picture shows
     unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
 ) -> Completion:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
@@ -81,9 +78,6 @@ def complete_picture(
     Straight edges that the hole cuts are continued: patches on them are copied from patches on edges.
 
     What is unknown near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
-
-    With a surface patches are compared and copied along its tangent planes, and what lies on another surface
-    than the patch's centre, such as something that stands in front, is not compared.
     """
     if not hole.any():
         return Completion(image.copy(), 0.0)
@@ -93,15 +87,14 @@ def complete_picture(
     known = ~(hole | unknown)
     rows, cols = nearest_allowed(known)
     image = np.where(known[..., None], image, image[rows, cols])  # what stood there means nothing
-    if surface is None:
-        motions = find_motions(image, hole, known)
-        image, regular = continue_regularly(image, hole, known, motions)
-        if (regular == hole).all():
-            return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
-        hole = hole & ~regular
+    motions = find_motions(image, hole, known)
+    image, regular = continue_regularly(image, hole, known, motions)
+    if (regular == hole).all():
+        return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
+    hole = hole & ~regular
     # where photos disagree a little, what they show tells edges all the same
-    edges = () if surface is not None else find_edges(given, asked, ~asked & given.any(-1))
-    done = _by_patches(image, hole, unknown, edges, surface, settings)
+    edges = find_edges(given, asked, ~asked & given.any(-1))
+    done = _by_patches(image, hole, unknown, edges, settings)
     if done is None:
         return Completion(given.copy(), float("nan"))
     level, field, colours = done
@@ -119,7 +112,6 @@ def _by_patches(
     hole: np.ndarray,
     unknown: np.ndarray,
     edges: tuple[Edge, ...],
-    surface: TangentPlanes | None,
     settings: ExemplarSettings,
 ) -> tuple[_Level, NearestNeighbourField, np.ndarray] | None:
     """The finest level, its field and the hole's colours, level by level; None if there is nothing to copy."""
@@ -127,8 +119,6 @@ def _by_patches(
     patch = np.ones((settings.patch,) * 2, np.uint8)
     hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), patch) > 0))
     unknown = unknown & ~hole
-    if surface is not None:  # what is filled is mixed with nothing
-        surface = surface._replace(clear=surface.clear | hole)
     levels = _pyramid(image, hole, radius, settings)
     while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
         radius -= 1
@@ -136,14 +126,12 @@ def _by_patches(
         return None
     field: NearestNeighbourField | None = None
     for number, (channels, open_) in enumerate(reversed(levels)):
-        there = None if surface is None else coarser(surface, len(levels) - 1 - number, open_.shape)
         shape = open_.shape[::-1]
         barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
         rounds = 1 if number else settings.coarse_rounds
         guide = guide_of(edges, open_.shape, 2 ** (len(levels) - 1 - number), max(radius, 1))
-        level = _prepared(channels, open_, barred, GUIDE * guide, there, radius, settings)
-        # patches that are warped along a surface are resampled: votes make up for that
-        mosaics = MOSAICS if surface is None and number == len(levels) - 1 else 0
+        level = _prepared(channels, open_, barred, GUIDE * guide, radius, settings)
+        mosaics = MOSAICS if number == len(levels) - 1 else 0
         colours, field = _filled(level, field, rounds, mosaics, settings)
     assert field is not None
     return level, field, colours
@@ -160,7 +148,6 @@ class _Level:
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
     trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
-    surface: TangentPlanes | None
     radius: int
 
 
@@ -169,7 +156,6 @@ def _prepared(
     hole: np.ndarray,
     unknown: np.ndarray,
     edges: np.ndarray,
-    surface: TangentPlanes | None,
     radius: int,
     settings: ExemplarSettings,
 ) -> _Level:
@@ -177,15 +163,10 @@ def _prepared(
     known = ~hole & ~unknown
     if not patch_centres(known, radius).any():
         known = ~hole
-    usable = known if surface is None else known & surface.clear
-    allowed = patch_centres(usable, radius)
-    if not allowed.any():
-        usable, allowed = known, patch_centres(known, radius)
-    if surface is not None and (whole := whole_patches(surface, allowed, radius)).any():
-        allowed = whole
+    allowed = patch_centres(known, radius)
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
     trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, edges, touching, usable, allowed, trust, surface, radius)
+    return _Level(channels, hole, edges, touching, known, allowed, trust, radius)
 
 
 def _filled(
@@ -199,17 +180,12 @@ def _filled(
     hole, allowed, radius = level.hole, level.allowed, level.radius
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
     guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
-    matching, reach = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps), REACH
+    matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps)
     if coarser is None:
-        rows, cols = fill_inwards(
-            level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE, level.surface, level.usable
-        )
+        rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
         colours = level.channels[rows[hole], cols[hole]]
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
-        if level.surface is None:
-            index = index_patches(patches, allowed, TREE_GRID)
-        else:
-            reach = max(hole.shape)
+        index = index_patches(patches, allowed, TREE_GRID)
     else:
         field = upsampled(coarser, level.touching)
         kept = field.found
@@ -226,7 +202,7 @@ def _filled(
         guides[hole] = colours[:, 3:]
         field = refined(
             field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,
-            index, np.dstack([guides, level.edges]), level.surface, level.usable, reach, tree_sweeps=1,
+            index, np.dstack([guides, level.edges]), tree_sweeps=1,
         )  # fmt: skip
         return field, _voted(level, field, _say(level, field), colours)
 
@@ -264,7 +240,7 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     """The hole's colours [N, 3] without seams: the gradients of what is copied, fixed at the rim.
 
     Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Patches vote for gradients as well;
-    unless they are warped along a surface, what the two pixels are copied from has its say. Rim pixels that the
+    what the two pixels are copied from has its say. Rim pixels that the
     patches do not agree with at all, such as remains of what was removed, do not spread.
     """
     rows, cols = np.nonzero(level.hole)
@@ -273,7 +249,7 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     picture = level.channels[box][..., :3].copy()
     picture[hole] = colours[:, :3]
     say = _say(level, field)
-    sources = _sources(level, field, colours) if level.surface is None else None
+    sources = _sources(level, field, colours)
 
     def wanted(where: np.ndarray, otherwise: np.ndarray, step: tuple[int, int] = (0, 0)) -> np.ndarray:
         whole = np.zeros(level.hole.shape, bool)
@@ -290,9 +266,8 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
         across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
         across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
         slope[across] = wanted(across, slope[across], (dy, dx))
-        if sources is not None:
-            copied = _copied_steps(level, sources, np.argwhere(across) + corner, (dy, dx))
-            slope[across] += COPIED * (copied - slope[across])
+        copied = _copied_steps(level, sources, np.argwhere(across) + corner, (dy, dx))
+        slope[across] += COPIED * (copied - slope[across])
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
     return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture, only_hole=True).values
@@ -383,24 +358,7 @@ def _voted(
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
     voted = otherwise.astype(np.float32)
     parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius
-    if level.surface is None:
-        run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
-    else:
-        number = np.zeros(weights.shape, np.int32)
-        number[level.touching] = np.arange(len(say))
-        support = supports(level.surface, np.argwhere(level.touching), level.radius)
-        warp = warps(level.surface, level.touching, field.rows, field.cols)
-        run_ranges(
-            _vote_slanted,
-            len(places),
-            *parts,
-            level.usable,
-            number,
-            support,
-            warp,
-            voted,
-            chunk=VOTE_PIXELS,
-        )
+    run_ranges(_vote, len(places), *parts, voted, chunk=VOTE_PIXELS)
     return voted
 
 
@@ -425,53 +383,6 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
                     else:
                         for c in range(count):
                             sums[c] += weight * channels[v, u, c]
-        if total > 0.0:
-            for c in range(count):
-                voted[k, c] = sums[c] / total
-
-
-@kernel
-def _vote_slanted(
-    lo, hi, channels, places, dy, dx, rows, cols, weights, radius, usable, number, support, warp, voted
-):  # fmt: skip
-    """Only pixels on the surface of a patch's centre; colours between four pixels of which all may be copied."""
-    h, w, _ = channels.shape
-    count, ends = voted.shape[1], 2 if dy + dx > 0 else 1
-    sums, one = np.empty(count), np.empty(count)
-    side = 2 * radius + 1
-    for k in range(lo, hi):
-        y, x = places[k]
-        total = 0.0
-        sums[:] = 0.0
-        for a in range(max(0, y + dy - radius), min(h, y + radius + 1)):
-            for b in range(max(0, x + dx - radius), min(w, x + radius + 1)):
-                n, votes = number[a, b], weights[a, b] > 0.0
-                one[:] = 0.0
-                for end in range(ends):
-                    i, j = y + end * dy - a, x + end * dx - b
-                    if not votes or support[n, (i + radius) * side + j + radius] == 0:
-                        votes = False
-                        break
-                    fu = cols[a, b] + warp[n, 0] * j + warp[n, 1] * i
-                    fv = rows[a, b] + warp[n, 2] * j + warp[n, 3] * i
-                    if not (0 <= fu <= w - 1 and 0 <= fv <= h - 1):
-                        votes = False
-                        break
-                    v, u = int(fv), int(fu)
-                    v1, u1 = min(v + 1, h - 1), min(u + 1, w - 1)
-                    if not (usable[v, u] and usable[v, u1] and usable[v1, u] and usable[v1, u1]):
-                        votes = False
-                        break
-                    s, t = fv - v, fu - u
-                    sign = 1.0 if end == ends - 1 else -1.0
-                    for c in range(count):
-                        top = (1 - t) * channels[v, u, c] + t * channels[v, u1, c]
-                        bottom = (1 - t) * channels[v1, u, c] + t * channels[v1, u1, c]
-                        one[c] += sign * ((1 - s) * top + s * bottom)
-                if votes:
-                    total += weights[a, b]
-                    for c in range(count):
-                        sums[c] += weights[a, b] * one[c]
         if total > 0.0:
             for c in range(count):
                 voted[k, c] = sums[c] / total

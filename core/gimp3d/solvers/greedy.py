@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import float32, int64
+from numba import float32
 
 from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import fma16, load16, splat16, sum16
 from .patches import lay_out
-from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, TangentPlanes, supports
 
 MOST_SOURCES = 4096  # patches that are tried for each place
 LEAST_SHARE = 1e-6  # what was copied without anything known around
@@ -23,8 +22,6 @@ def fill_inwards(
     allowed: np.ndarray,  # [H, W] bool, centres of source patches, at least one
     radius: int,
     first: np.ndarray,  # [H, W] float32 in [0, 1]: how near a place is to a line that is filled before the rest
-    surface: TangentPlanes | None,  # copy along its tangent planes
-    usable: np.ndarray,  # [H, W] bool, what may be copied then
 ) -> tuple[np.ndarray, np.ndarray]:
     """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.
 
@@ -40,12 +37,7 @@ def fill_inwards(
     found_rows, found_cols = np.full((2, *hole.shape), -1, np.int32)
     share = cv2.blur(known, (2 * radius + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
     places = np.argwhere(hole)
-    number = np.full(hole.shape, -1)
-    number[hole] = np.arange(len(places))
-    _fill_inwards(
-        *patches, first, places, rows[thinned], cols[thinned], usable, known, share, surface is not None,
-        *(surface or NO_SURFACE), supports(surface, places, radius), number, found_rows, found_cols,
-    )  # fmt: skip
+    _fill_inwards(*patches, first, places, rows[thinned], cols[thinned], known, share, found_rows, found_cols)
     return found_rows, found_cols
 
 
@@ -79,15 +71,14 @@ def _edge_into_hole(values, stride, channels, radius, known, y, x):
 
 @kernel
 def _fill_inwards(
-    values, stride, channels, radius, row_weights, first, places, source_rows, source_cols, usable, known, share,
-    slanted, point, normal, frame, inverse, plane, clear, support, number, rows, cols,
+    values, stride, channels, radius, row_weights, first, places, source_rows, source_cols, known, share, rows, cols,
 ):  # fmt: skip
     """`known` and `share` are [H + 2 radius, W + 2 radius]: a pixel's confidence and its mean over the patch."""
     h, w = rows.shape
     size, width = 2 * radius + 1, len(row_weights)
     weights = np.empty(size * width, np.float32)
     edges = np.full((h, w), float32(-1))  # into the hole at places of its rim; negative: to be told anew
-    stamp = max(1, radius // 2)  # half the square that is copied at once
+    stamp = min(radius, max(1, radius // 2))  # half the square that is copied at once
     left = len(places)
     while left > 0:
         best, y, x = float32(-1), -1, -1
@@ -107,64 +98,23 @@ def _fill_inwards(
                 priority *= float32(1e-6)  # its turn comes only where the hole has no rim
             if priority > best:
                 best, y, x = priority, a, b
-        if slanted:  # only what lies on the place's own surface counts as known
-            counted = float32(0)
-            for i in range(size * size):
-                if support[number[y, x], i] != 0:
-                    counted += known[y + i // size, x + i % size]
-            counted /= size * size
-            if counted < 0.999 * share[y + radius, x + radius]:
-                share[y + radius, x + radius] = counted
-                continue
         best_share = share[y + radius, x + radius]
         for i in range(size):
             for j in range(width):
                 there = j < size * channels and known[y + i, x + j // channels] > 0
-                if there and slanted:
-                    there = support[number[y, x], i * size + j // channels] != 0
                 weights[i * width + j] = float32(1) if there else float32(0)
         least, best_v, best_u = float32(1e30), source_rows[0], source_cols[0]
         for k in range(len(source_rows)):
             v, u = source_rows[k], source_cols[k]
             one, other = y * stride + x * channels, v * stride + u * channels
-            if slanted:
-                distance = float32(0)
-                xx = frame[v, u, 0] * inverse[y, x, 0] + frame[v, u, 1] * inverse[y, x, 2]
-                xy = frame[v, u, 0] * inverse[y, x, 1] + frame[v, u, 1] * inverse[y, x, 3]
-                yx = frame[v, u, 2] * inverse[y, x, 0] + frame[v, u, 3] * inverse[y, x, 2]
-                yy = frame[v, u, 2] * inverse[y, x, 1] + frame[v, u, 3] * inverse[y, x, 3]
-                areas = xx * yy - xy * yx
-                if areas < SCALES[0] or areas > SCALES[1]:
-                    continue
-                off = float32(0)
-                for c in range(3):
-                    distance += NORMAL * (normal[y, x, c] - normal[v, u, c]) ** 2
-                    off += normal[y, x, c] * (point[v, u, c] - point[y, x, c])
-                off /= point[y, x, 2]
-                distance = size * size * channels * (distance + min(OFF_PLANE * off * off, FURTHEST_OFF))
-                for i in range(size * size):
-                    dy, dx = i // size - radius, i % size - radius
-                    if weights[i // size * width + i % size * channels] == 0:
-                        continue
-                    a = v + int64(np.floor(yx * dx + yy * dy + float32(0.5)))
-                    b = u + int64(np.floor(xx * dx + xy * dy + float32(0.5)))
-                    if a < 0 or b < 0 or a >= h or b >= w or not usable[a, b]:
-                        distance = float32(1e30)
-                    if distance >= least:
-                        break
-                    one = (y + dy + radius) * stride + (x + dx + radius) * channels
-                    other = (a + radius) * stride + (b + radius) * channels
-                    for c in range(channels):
-                        distance += (values[one + c] - values[other + c]) ** 2
-            else:
-                total = splat16(float32(0))
-                for i in range(size):
-                    for j in range(0, width, 16):
-                        difference = load16(values, one + j) - load16(values, other + j)
-                        total = fma16(difference * load16(weights, i * width + j), difference, total)
-                    one += stride
-                    other += stride
-                distance = sum16(total)
+            total = splat16(float32(0))
+            for i in range(size):
+                for j in range(0, width, 16):
+                    difference = load16(values, one + j) - load16(values, other + j)
+                    total = fma16(difference * load16(weights, i * width + j), difference, total)
+                one += stride
+                other += stride
+            distance = sum16(total)
             if distance < least:
                 least, best_v, best_u = distance, v, u
         for a in range(max(0, y - stamp), min(h, y + stamp + 1)):
@@ -172,8 +122,6 @@ def _fill_inwards(
                 if known[a + radius, b + radius] > 0:
                     continue
                 q, p = best_v + a - y, best_u + b - x
-                if slanted and not (0 <= q < h and 0 <= p < w and usable[q, p]):
-                    q, p = best_v, best_u
                 rows[a, b], cols[a, b] = q, p
                 left -= 1
                 one = (a + radius) * stride + (b + radius) * channels

@@ -23,7 +23,6 @@ from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
 from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
 from .patches import Patches, coordinates, lay_out
-from .surface import FURTHEST_OFF, NO_SURFACE, NORMAL, OFF_PLANE, SCALES, TangentPlanes, supports
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
@@ -31,7 +30,6 @@ TRUNCATION = 8.0  # px; offsets that differ by more are incoherent: coherence is
 GRID = 2  # px between the sources that the tree holds; sweeps look at those between
 TREE_SWEEPS = 2  # the first ones, which look into the neighbours' leaves of the tree
 REACH = 4  # px, of the random search round the best source
-IMPOSSIBLE = np.float32(1e6)  # cost of a slanted patch that reaches into the hole
 SAME = np.float32(255.0**-2 / 4)  # half a grey level: the tree is not asked for better, or plain areas lose coherence
 TIE = 1e-6  # cost of a source one image width away, (1/4 grey level)²: it only decides between equal patches
 
@@ -109,8 +107,6 @@ def refined(
     penalty: np.ndarray | None = None,  # [H, W] float32
     index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
-    surface: TangentPlanes | None = None,  # compare patches on its tangent planes
-    usable: np.ndarray | None = None,  # [H, W] bool, pixels that slanted patches may be copied from; None: not target
     reach: int = REACH,  # px, of the random search
     tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
@@ -126,7 +122,6 @@ def refined(
     weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
     number, wanted = np.zeros((h, w), np.int32), np.nonzero(target)
     number[wanted] = np.arange(len(wanted[0]))
-    support = supports(surface, np.stack(wanted, 1), patches.radius)
     tree, looks = NO_TREE, np.empty(0, np.float32)
     if index is not None:
         tree, looks = index.tree, coordinates(patches, index.components, patches.starts(*wanted)).ravel()
@@ -139,7 +134,6 @@ def refined(
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
             *tree, index is not None and sweep < tree_sweeps, looks, number,
-            surface is not None, *(surface or NO_SURFACE), support, ~target if usable is None else usable,
             *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
@@ -185,7 +179,6 @@ def _sweep_band(
     target, allowed, values, stride, channels, radius, row_weights, penalty,
     weight, coherence, truncation, tie, guides,
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
-    slanted, point, normal, frame, inverse, plane, clear, support, usable,
     start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost, band,
 ):  # fmt: skip
     """One sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones
@@ -227,14 +220,7 @@ def _sweep_band(
                         continue
                     q, p = (rows[a, b], cols[a, b]) if lo <= a < hi else (old_rows[a, b], old_cols[a, b])
                     q, p = int64(q), int64(p)
-                    if slanted and q >= 0:
-                        k = 0 if dx else 1  # the column of A: one step along x or along y
-                        xx, xy = frame[q, p, 0] * inverse[a, b, k], frame[q, p, 1] * inverse[a, b, k + 2]
-                        yx, yy = frame[q, p, 2] * inverse[a, b, k], frame[q, p, 3] * inverse[a, b, k + 2]
-                        q += int64(np.floor(step * (yx + yy) + float32(0.5)))
-                        p += int64(np.floor(step * (xx + xy) + float32(0.5)))
-                    else:
-                        q, p = q + dy, p + dx
+                    q, p = q + dy, p + dx
                     if q < 0 or p < 0 or q >= h or p >= w:
                         continue
                     if in_leaves:
@@ -293,48 +279,14 @@ def _sweep_band(
                 if extra + bound >= best:
                     continue
                 one, other = here, q * stride + p * channels
-                if slanted:
-                    xx = frame[q, p, 0] * inverse[y, x, 0] + frame[q, p, 1] * inverse[y, x, 2]
-                    xy = frame[q, p, 0] * inverse[y, x, 1] + frame[q, p, 1] * inverse[y, x, 3]
-                    yx = frame[q, p, 2] * inverse[y, x, 0] + frame[q, p, 3] * inverse[y, x, 2]
-                    yy = frame[q, p, 2] * inverse[y, x, 1] + frame[q, p, 3] * inverse[y, x, 3]
-                    turned, off = float32(0), float32(0)
-                    for k in range(3):
-                        turned += (normal[y, x, k] - normal[q, p, k]) ** 2
-                        off += normal[y, x, k] * (point[q, p, k] - point[y, x, k])
-                    off /= point[y, x, 2]
-                    extra += NORMAL * turned + min(OFF_PLANE * off * off, FURTHEST_OFF)
-                    if extra + bound >= best:
-                        continue
-                    areas = xx * yy - xy * yx
-                    found, count = float32(0), 0 if SCALES[0] <= areas <= SCALES[1] else -1
-                    for k in range(size * size):
-                        if count < 0 or support[number[y, x], k] == 0:
-                            continue
-                        dy, dx = k // size - radius, k % size - radius
-                        c = q + int64(np.floor(yx * dx + yy * dy + float32(0.5)))
-                        d = p + int64(np.floor(xx * dx + xy * dy + float32(0.5)))
-                        if c < 0 or d < 0 or c >= h or d >= w or not usable[c, d]:
-                            count = -1
-                            continue
-                        count += 1
-                        one = here + (dy + radius) * stride + (dx + radius) * channels
-                        other = (c + radius) * stride + (d + radius) * channels
-                        for n in range(channels):
-                            found += (values[one + n] - values[other + n]) ** 2
-                    if count < 0:
-                        found = IMPOSSIBLE
-                    else:
-                        found *= weight / float32(count * channels)
-                else:
-                    total = splat16(float32(0))
-                    for _ in range(size):
-                        for k in range(0, len(row_weights), 16):
-                            difference = load16(values, one + k) - load16(values, other + k)
-                            total = fma16(difference * load16(row_weights, k), difference, total)
-                        one += stride
-                        other += stride
-                    found = weight * sum16(total)
+                total = splat16(float32(0))
+                for _ in range(size):
+                    for k in range(0, len(row_weights), 16):
+                        difference = load16(values, one + k) - load16(values, other + k)
+                        total = fma16(difference * load16(row_weights, k), difference, total)
+                    one += stride
+                    other += stride
+                found = weight * sum16(total)
                 if found + extra < best:
                     best, own = found + extra, found + penalty[q, p]
                     v, u = q, p

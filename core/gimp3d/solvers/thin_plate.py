@@ -1,8 +1,7 @@
 """Thin plates: the smoothest continuation of scattered values, slopes and bends included.
 
 A membrane (Laplace's equation) is fixed at the rim and forgets how the surface came to it. A thin plate keeps the
-slope: on curved ground its error is a half to a quarter of a membrane's, measured on random scenes
-(`make bench-depth`).
+slope: on curved ground its error is a half to a quarter of a membrane's, measured on random scenes.
 """
 
 from __future__ import annotations

@@ -57,12 +57,6 @@ class ViewAfter:
     alpha: np.ndarray  # float32
     weight: np.ndarray  # blend weight of the removed Gaussians, with the object in place
 
-    def untrusted(self, before: ViewBefore) -> np.ndarray:
-        """[H, W] bool: pixels that are no evidence of what is behind the object."""
-        hidden = before.misfit
-        hidden[self.window] |= self.weight > MOSTLY_OBJECT
-        return hidden if before.extra is None else hidden | before.extra
-
 
 def outlines(region: Region, camera: Camera) -> list[np.ndarray]:
     """The boxes' outlines in a view, [M, 2] pixels each; none where no pixel's centre lies in any."""

@@ -1,7 +1,6 @@
-"""The stage that finds what goes and where each view has to be filled then (paper 3.2, docs/method.md).
+"""The stage that finds what goes, and what each view shows then (paper 3.2, docs/method.md).
 
-`look` shows each view with and without the object, `selection` decides which Gaussians go, `targets` which pixels are
-to be filled.
+`look` shows each view with and without the object, `selection` decides which Gaussians go.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from ..progress import Progress, silent
 from .growth import NOTHING, Growth
 from .look import MOSTLY_OBJECT, ViewAfter, ViewBefore, look, look_without, outlines
 from .selection import Selection, SelectionSettings, by_centre, choose, select_removed
-from .targets import CHANGED, all_needed, in_front, uncovered
+from .targets import CHANGED, in_front, uncovered
 from .visibility import depth_agreement
 
 T = TypeVar("T")
@@ -40,7 +39,6 @@ class MaskSettings:
     """How it is found what goes, and which pixels are to be filled."""
 
     mode: Literal["need", "paper"] = "need"  # need or paper; only what no view shows, or all that guards leave open
-    margin: int = 2  # px; a target grows by so much: fewer mixed pixels at its rim, more to fill
     grow: bool = False  # yes or no; what the boxes cut off of the object goes too, and maybe what only looks like it
     selection: SelectionSettings = SelectionSettings()
 
@@ -125,10 +123,10 @@ def find_masks(
     photos: Mapping[str, np.ndarray] | None = None,  # ID → [H, W, 3] uint8, with the object
     extra: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, to be filled too: shadows, reflections
 ) -> Masks:
-    """Select the object's Gaussians and find the target region T of every view (paper 3.2; docs/method.md).
+    """Select the object's Gaussians and tell what every view shows with and without them (paper 3.2; docs/method.md).
 
-    Every view is drawn a fixed number of times. What appears behind the object is judged as points of space, by all
-    views together, so that all targets agree.
+    The target region T of a view is what the extra masks ask for and, in the mode "paper", what the paper fills; else
+    charts add to it what no photo shows (`clearing.chart_targets`). Every view is drawn a fixed number of times.
 
     Raises
     ------
@@ -164,14 +162,13 @@ def find_masks(
     mode, warnings = settings.mode, _inconsistencies(before, agreement) if settings.mode == "need" else ()
     if warnings:
         mode = "paper"
-    if mode == "paper":
-        holes = parallel_map(lambda b: uncovered(gaussians, selection.removed, b), before)
-    else:
-        holes = all_needed(before, after, np.mean([box.center for box in region], axis=0), settings.margin)
-    both = list(zip(before, after, holes))
-    views = tuple(parallel_map(lambda v: _view_masks(*v, not warnings, settings.margin), both))
-    share = sum(v.target.sum() for v in views) / max(1, sum(v.polygon.sum() for v in views))
-    reason = f"{selection.words}; {len(views)} views see the region, {share:.0%} of its projection needs filling"
+
+    def masked(both: tuple[ViewBefore, ViewAfter]) -> ViewMasks:
+        hole = uncovered(gaussians, selection.removed, both[0]) if mode == "paper" else None
+        return _view_masks(*both, hole, not warnings)
+
+    views = tuple(parallel_map(masked, list(zip(before, after))))
+    reason = f"{selection.words}; {len(views)} views see the region"
     told = [growth.words] if growth and growth.words else []
     if settings.grow and growth is None:
         told = ["--grow does nothing here: the boxes alone tell what goes, as always in the preset paper"]
@@ -230,14 +227,16 @@ def _inconsistencies(before: Sequence[ViewBefore], agreement: float) -> tuple[st
     return tuple(found)
 
 
-def _view_masks(before: ViewBefore, after: ViewAfter, needed: np.ndarray, consistent: bool, margin: int) -> ViewMasks:
+def _view_masks(before: ViewBefore, after: ViewAfter, needed: np.ndarray | None, consistent: bool) -> ViewMasks:
     window, depth = after.window, before.depth
     silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
     silhouette[window] = after.weight > CHANGED
     if consistent:  # else depths say nothing
-        occluder[window] = in_front(depth[window], after.weight > MOSTLY_OBJECT, max(1, margin))
+        occluder[window] = in_front(depth[window], after.weight > MOSTLY_OBJECT)
     beside[window] = dilated(occluder[window], 2)
-    target = needed & ~occluder & (silhouette | ~beside)  # beside what is in front T must not outgrow the object
+    target = np.zeros(depth.shape, bool)
+    if needed is not None:  # beside what is in front T must not outgrow the object
+        target = needed & ~occluder & (silhouette | ~beside)
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     depth_after, alpha_after = before.depth.copy(), before.alpha.copy()

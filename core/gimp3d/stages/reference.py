@@ -12,14 +12,11 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
-from ..solvers.planes import RING
-from .depth import DepthSettings, complete_disparity
+from .depth import RING, complete_depth
 from .masks import ViewMasks
 
 SAMPLES = 2000  # of the hidden surface from each view, about
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
-# Where the hidden surface is, about: coarse and fast.
-PROVISIONAL = DepthSettings(unknowns=1000, small_part=300)
 
 
 @dataclass(frozen=True)
@@ -71,7 +68,7 @@ def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
     camera, part = _coarse(view, max(1, round(math.sqrt(view.target.sum() / samples))))
     target, depth = view.target[part], view.depth_after[part]
     try:
-        completed = complete_disparity(disparity_of(depth), rim(view)[part], target, settings=PROVISIONAL)
+        completed = complete_depth(disparity_of(depth), rim(view)[part], target)
     except IllPosed:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
     depth = np.where(target, completed.depth, depth)

@@ -15,13 +15,13 @@ from ..errors import BadInput
 from ..geometry import colours_at, disparity_of, sees
 from ..presets import RemovalSettings
 from ..priors.appearance import Appearance
+from ..priors.builtin import PROVIDERS
 from ..priors.calls import Call
 from ..priors.inpaint import inpaint_reference
 from ..priors.monodepth import depth_prior, looks
 from ..priors.pasting import paste_picture
 from ..stages.charts import CHART, Chart, chart_number
-from ..stages.depth import DepthCompletion, complete_depth
-from ..stages.evidence import gather_evidence
+from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.propagate import Reference
 from ..stages.reference import rim
 from ..view_state import ViewState
@@ -66,8 +66,16 @@ def turns_of(
         return [Turn(named, reference, picture), *(Turn(k) for k in range(len(charts)) if k != named)]
     # A depth prior, or a file that fills, belongs to a view and needs that view.
     of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
-    views = [Turn(None, reference, picture), *[Turn()] * settings.extra_references]
+    views = [Turn(None, reference, picture)]
+    if not left_to_charts(charts, views[0], settings):
+        views += [Turn()] * settings.extra_references
     return [*(views if not charts or reference is not None or of_view else []), *map(Turn, range(len(charts)))]
+
+
+def left_to_charts(charts: Sequence[Chart], turn: Turn, settings: RemovalSettings) -> bool:
+    """Whether a view's hole is filled on charts, where textures lie flat: nobody else paints it or tells its depth."""
+    ours = settings.inpaint in PROVIDERS and settings.depth_prior == "auto"
+    return bool(charts) and turn.picture is None and ours
 
 
 def _named_chart(reference: str | None, charts: Sequence[Chart], settings: RemovalSettings) -> int | None:
@@ -144,7 +152,6 @@ def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSet
 
 def complete_view_depth(
     view: ViewState,
-    views: Sequence[ViewState],
     settings: RemovalSettings,
     picture: np.ndarray | None,
     first: bool,  # reference; a file's prior is of that view
@@ -160,9 +167,8 @@ def complete_view_depth(
         there = view.hits.depth
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
-        known, no_ring = np.ones(depth.shape, np.float32), np.zeros((0, 2), np.float32)
         words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(disparity_of(depth), depth, known, 0.0, no_ring, (0.0, 0.0), 0, share, words)
+        return DepthCompletion(disparity_of(depth), depth, share, words, PriorFit())
     looked_at, spec = None, settings.depth_prior
     if spec.startswith("file:") and not first:
         spec = "auto"
@@ -175,38 +181,31 @@ def complete_view_depth(
     prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     depth_settings = replace(settings.depth, surface=surface)
-    others = [v.left for v in views]
-    return complete_depth(masks, others, disparity_of(masks.depth_after), rim(masks), prior, depth_settings)
+    known = rim(masks) & ~masks.occluder
+    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, depth_settings)
 
 
 def paint_view(
-    view: ViewState,
-    depth: np.ndarray,  # [H, W] z of the completed reference
-    views: Sequence[ViewState],
-    settings: RemovalSettings,
-    picture: np.ndarray | None,
-    call: Call,
+    view: ViewState, charts: Sequence[Chart], settings: RemovalSettings, picture: np.ndarray | None, call: Call
 ) -> Appearance:
-    """The view without the object: the given picture, or what photos show and the provider's fill for the rest."""
-    masks, base = view.left, view.painted
+    """The view without the object: the given picture, or what charts show and the provider's fill for the rest."""
+    masks, (base, seen) = view.left, _shown_by(charts, view)
     if picture is not None:
         return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
-    seen = np.zeros_like(masks.target)
-    if settings.use_evidence:
-        # What the removed Gaussians show, such as a shadow in a box of its own, is no evidence.
-        sources = ((v.camera, v.bare, np.where(v.left.silhouette, 0, v.left.depth_before)) for v in views)
-        evidence = gather_evidence(masks.camera, depth, masks.target, sources)
-        seen = evidence.seen
-        base = np.where(seen[..., None], evidence.image, base)
     filled = inpaint_reference(
-        settings.inpaint,
-        base,
-        masks.target & ~seen,
-        settings.random_seed,
-        disparity_of(depth),
-        masks.camera.K,
-        call=call,
-        variant=settings.variant,
+        settings.inpaint, base, masks.target & ~seen, settings.random_seed, call=call, variant=settings.variant
     )
     share = seen.sum() / max(1, masks.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
+
+
+def _shown_by(charts: Sequence[Chart], view: ViewState) -> tuple[np.ndarray, np.ndarray]:
+    """The view with what charts know of its hole, and where that is [H, W] bool."""
+    image, seen = view.painted.copy(), np.zeros(view.left.target.shape, bool)
+    for number, chart in enumerate(charts):
+        assert view.hits is not None
+        on = view.left.target & (view.hits.chart == number)
+        on[on] = chart.known[view.hits.rows[on], view.hits.cols[on]]
+        image[on] = chart.image[view.hits.rows[on], view.hits.cols[on]]
+        seen |= on
+    return image, seen

@@ -12,12 +12,13 @@ from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SOLID, dilated, window_mask
 from ..raster import Window, drawing, render_bytes, touched_window
-from ..stages.masks import MaskSettings, ViewMasks
+from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Reference, Rule
-from ..stages.targets import LAYER_STEP
 from ..view_state import ViewState
 
 OPAQUE = 0.99  # alpha of the emptied scene below which a gap shows through
+LAYER_STEP = 0.05  # relative z step that parts two surfaces
+MARGIN = 2  # px round T in which splats mix what is old and new
 DRAWN = 0.5  # blend weight of new Gaussians from which they cover a pixel
 
 
@@ -39,7 +40,6 @@ def after_reference(
     filled: Gaussians,  # the scene with the new Gaussians, which are its last rows
     new: Gaussians,  # that this reference brought
     added: int,  # all new ones
-    settings: MaskSettings,
 ) -> tuple[ViewState, ...]:
     """The views with what a reference painted, and what of them it left open."""
     by_id = {p.camera_id: p for p in painted}
@@ -53,7 +53,7 @@ def after_reference(
         picture = redrawn(part.pasted(view.painted), filled, view.masks, touched)
         left = view.left
         if left.target.any():
-            left = still_open(left, filled, added, rules, window_mask(touched, view.camera), settings)
+            left = still_open(left, filled, added, rules, window_mask(touched, view.camera))
         return replace(view, painted=picture, rules=told, best=best, left=left)
 
     return tuple(parallel_map(after, views))
@@ -81,7 +81,6 @@ def still_open(
     added: int,
     rules: np.ndarray,
     touched: np.ndarray,  # [H, W] bool, where the last new Gaussians may be: elsewhere the view is as it was
-    settings: MaskSettings,
 ) -> ViewMasks:
     """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
 
@@ -91,8 +90,8 @@ def still_open(
     """
     new = np.zeros(len(filled), bool)
     new[-added:] = True
-    side = 2 * settings.margin + 1
-    near = touched | dilated(view.target, settings.margin)
+    side = 2 * MARGIN + 1
+    near = touched | dilated(view.target, MARGIN)
     scene = drawing(filled, view.camera, with_colour=False, pixels=near)
     before = view.depth_after, view.alpha_after
     depth, alpha = (np.where(touched, d, b) for d, b in zip(scene.surface_depth(), before))

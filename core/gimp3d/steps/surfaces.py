@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..box import Region
+from ..errors import IllPosed
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
@@ -41,16 +42,23 @@ class Surfaces:
 
 
 def find_surfaces(
-    scene: Gaussians, region: Region, masks: Masks, views: Sequence[ViewState], settings: RemovalSettings
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+    settled: bool = True,
 ) -> Surfaces:
-    """The planes that run into what the object hid."""
+    """The planes that run into what the object hid, settled by photos or as they are drawn."""
     assert settings.charts is not None
+    if all(view.silhouette.all() for view in masks.views):
+        raise IllPosed("the object hides everything in every view: nothing is left to fill from, add views")
     # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
     objects = tuple(object_pixels(scene, masks.removed, masks.views, settings.clearing))
     rough = Surfaces((), (), masks.selection, objects, marked, 1.0, "")
     witnesses = rough.witnesses(views)
-    planes = find_planes(masks.views, witnesses, region, settings.charts)
+    planes = find_planes(masks.views, witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, masks.views, witnesses, region, settings.charts)
     reason = f"{len(planes)} planes run into what the object hid"
     found = replace(rough, planes=planes, laid=laid, reason=reason)

@@ -169,7 +169,7 @@ def scripted(folder, body):
 @pytest.mark.parametrize("provider", ["onnx", "torchscript", "command"])
 def test_who_predicts_disparity_guides_the_completion(tmp_path, provider):
     """From the file to the depth: somebody has learned this scene, up to scale and shift, which the ring tells."""
-    from gimp3d.stages.depth import complete_disparity
+    from gimp3d.stages.depth import complete_depth
 
     v, u = np.mgrid[:120, :160]
     truth = 0.3 + 0.1 * np.exp(-((u - 86) ** 2 + (v - 66) ** 2) / 300) + 0.05 * np.sin(u / 15)
@@ -183,8 +183,8 @@ def test_who_predicts_disparity_guides_the_completion(tmp_path, provider):
     else:
         spec = scripted(tmp_path, "np.save(out, cv2.imread(image)[..., 1] / 7 - 3)") + " {npy}"
     hole = np.hypot(v - 60, u - 80) < 28
-    prior = relative_disparity(depth_prior(spec, 120, 160, image), truth, ~hole)
-    found = complete_disparity(np.where(hole, 9, truth), ~hole, hole, prior)
+    prior = depth_prior(spec, 120, 160, image)
+    found = complete_depth(np.where(hole, 9, truth), ~hole, hole, prior)
     assert looks(spec) and found.reason.startswith("guided")
     assert np.percentile(np.abs(found.depth * truth - 1)[hole], 95) < 0.01
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
-from scenes import BLOCK, REGION, block, cameras, discs, floor, scene, truth
+from scenes import BLOCK, REGION, block, cameras, charted, discs, floor, scene, truth
 
 from gimp3d.box import Box, read_region
 from gimp3d.camera import Camera
@@ -34,7 +34,7 @@ RIM = np.ones((3, 3), np.uint8)  # a 1-px rim on every side
 
 
 def test_the_target_covers_the_hole_and_little_more() -> None:
-    masks = find_masks(scene(), REGION, cameras())
+    masks = charted(scene(), REGION, cameras()).masks
     assert masks.removed.sum() >= len(block())
     for view in masks.views:
         true = render(truth(), view.camera).median_depth
@@ -45,18 +45,18 @@ def test_the_target_covers_the_hole_and_little_more() -> None:
         assert not view.target[true == 0].any() or view.target[true == 0].sum() < 0.1 * view.target.sum()
 
 
-@pytest.mark.parametrize("zoom", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("zoom", [0.3, 0.5])
 def test_holes_of_a_few_pixels_are_in_the_target(zoom: float) -> None:
     """Rows of the floor under the block, one to four pixels high in the views from low down."""
     views = [replace(c, fx=zoom * c.fx, fy=zoom * c.fy) for c in cameras()]
-    found = find_masks(scene(), REGION, views).views
+    found = charted(scene(), REGION, views).masks.views
     hidden = [hidden_floor(v.camera) for v in found]
     assert min(h.sum() for h in hidden) < 25 and all(h.any() for h in hidden)
     assert sum((v.target & h).sum() for v, h in zip(found, hidden)) > 0.97 * sum(h.sum() for h in hidden)
 
 
 def test_need_is_smaller_than_paper_and_both_lie_where_the_object_was() -> None:
-    need = find_masks(scene(), REGION, cameras())
+    need = charted(scene(), REGION, cameras()).masks
     paper = find_masks(scene(), REGION, cameras(), MaskSettings(mode="paper"))
     assert 0 < need.hole_pixels < paper.hole_pixels
     for view in paper.views:
@@ -86,7 +86,7 @@ def test_nothing_selected_everything_selected_no_view_and_unknown_mode() -> None
 
 def test_views_of_mixed_sizes_and_intrinsics() -> None:
     mixed = [c.scaled(f) for c, f in zip(cameras(), (1, 0.5, 1.3, 0.77, 1, 1, 1, 1, 1))]
-    masks = find_masks(scene(), REGION, mixed)
+    masks = charted(scene(), REGION, mixed).masks
     for view in masks.views:
         assert view.target.shape == (view.camera.height, view.camera.width) and view.target.any()
 
@@ -109,7 +109,7 @@ def test_targets_of_all_views_agree(seed: int, count: int, guessed: bool) -> Non
     chosen = rng.permutation(24)[:count]
     views = [c for k, c in enumerate(cameras(24, 140, 105)) if k in chosen]
     whole = (truth() if guessed else floor(with_hole=True)).extended(block())
-    masks = find_masks(whole, REGION, views)
+    masks = charted(whole, REGION, views).masks
     inner = np.linspace(-0.22, 0.22, 23)
     points = np.stack([*(g.ravel() for g in np.meshgrid(inner, inner)), np.zeros(23 * 23)], -1)
     for view in masks.views:
@@ -132,7 +132,7 @@ def test_what_a_view_saw_is_not_in_any_target() -> None:
         0.025,
     )
     front = [c for c in cameras(24, 140, 105) if c.centre[1] > -0.5]
-    masks = find_masks(scene().extended(wall), REGION, front)
+    masks = charted(scene().extended(wall), REGION, front).masks
     assert len(front) > 12
     for view in masks.views:
         away = cv2.dilate(hidden_floor(view.camera).astype(np.uint8), RIM, iterations=6) == 0
@@ -159,7 +159,8 @@ def test_extra_masks_are_filled_and_never_evidence() -> None:
     seen = [c for c in views if (painted[c.id] & (surface_depth(flat, c)[0] == surface_depth(dark, c)[0])).sum() > 40]
     some = find_masks(dark, REGION, views, extra={seen[0].id: painted[seen[0].id]})
     assert some.removed[shadow].mean() > 0.5  # one mask is enough, and fills the other views too
-    other = next(v for v in some.views if v.camera.id == seen[-1].id)
+    both = charted(dark, REGION, views, extra={seen[0].id: painted[seen[0].id]}).masks
+    other = next(v for v in both.views if v.camera.id == seen[-1].id)
     assert len(seen) > 1 and other.target[render(flat, other.camera).alpha > 0.9].mean() > 0.8
     with pytest.raises(BadInput, match="extra mask"):
         find_masks(dark, REGION, views, extra={views[0].id: np.ones((3, 4), bool)})
@@ -188,17 +189,6 @@ def test_views_that_do_not_fit_fall_back_to_the_papers_targets(monkeypatch: pyte
     assert vague.mode == "paper" and "alike" in vague.warnings[0] and vague.hole_pixels > 0.9 * paper.hole_pixels
 
 
-def test_what_a_nearer_surface_encloses_does_not_go_on_behind_the_object() -> None:
-    """Behind an object on a table: a far wall, seen past the table's edge, or the ground through a gap."""
-    rows, cols = np.mgrid[:120, :120]
-    touched = np.hypot(rows - 60, cols - 60) < 30
-    wall, gap = rows < 60, np.hypot(rows - 50, cols - 60) < 12
-    for far, goes_on in ((wall, True), (gap, False)):
-        depth = np.where(far, 9.0, 2.0).astype(np.float32)
-        found = targets.continues_outside(depth, np.ones_like(depth), touched, 2.0)
-        assert (found[touched & far] == goes_on).all() and found[~far].all()
-
-
 @pytest.mark.parametrize(("agreement", "support"), [(1.0, 0.05), (0.97, 0.05), (0.77, 0.25)])
 def test_the_worse_views_agree_the_more_photos_must_vouch_for_what_is_revealed(
     monkeypatch: pytest.MonkeyPatch, agreement: float, support: float
@@ -225,16 +215,16 @@ def test_constant_photos_say_nothing() -> None:
 
 def test_a_box_partly_behind_a_camera() -> None:
     beam = (Box.make([0, 0, 0.26], [0.62, 9.0, 0.56]),)  # reaches behind cameras that stand in its line
-    masks = find_masks(scene(), beam, cameras())
+    masks = charted(scene(), beam, cameras()).masks
     assert masks.views and masks.hole_pixels > 0
     assert masks.removed[len(floor(True)) :].all()
 
 
 def test_running_again_on_the_result_is_calm() -> None:
-    first = find_masks(scene(), REGION, cameras())
+    first = charted(scene(), REGION, cameras()).masks
     rest = scene().take(~first.removed)
     filled = rest.extended(truth().take((np.abs(truth().means[:, :2]) <= BLOCK / 2).all(1)))
-    again = find_masks(filled, REGION, cameras())
+    again = charted(filled, REGION, cameras()).masks
     assert again.hole_pixels < 2 * first.hole_pixels
 
 
@@ -252,8 +242,8 @@ def test_poses_may_be_off_by_a_pixel_or_two(pixels: float) -> None:
         matrix[:3] = turn @ matrix[:3]
         return replace(camera, viewmat=matrix)
 
-    exact = find_masks(scene(), REGION, views, photos=photos)
-    bent = find_masks(scene(), REGION, [off(c) for c in views], photos=photos)
+    exact = charted(scene(), REGION, views, photos).masks
+    bent = charted(scene(), REGION, [off(c) for c in views], photos).masks
     assert bent.mode == "need"
     assert (exact.removed != bent.removed).mean() < 0.01
     assert bent.removed[len(floor(True)) :].all()
@@ -263,8 +253,8 @@ def test_poses_may_be_off_by_a_pixel_or_two(pixels: float) -> None:
 @pytest.mark.parametrize("scale", [0.9, 1.1, 1.2])
 def test_the_region_may_be_drawn_too_large_or_small(scale: float) -> None:
     views = cameras(9, 240, 180)
-    exact = find_masks(scene(), REGION, views)
-    other = find_masks(scene(), (replace(REGION[0], size=scale * REGION[0].size),), views)
+    exact = charted(scene(), REGION, views).masks
+    other = charted(scene(), (replace(REGION[0], size=scale * REGION[0].size),), views).masks
     rows = slice(len(floor(True)), None)
     assert other.removed[rows].mean() > 0.99
     assert other.removed[: len(floor(True))].mean() < 0.05

@@ -7,26 +7,24 @@ from functools import cache
 
 import cv2
 import numpy as np
-from scenes import BLOCK, REGION, cameras, floor, floor_colours, scene
+from scenes import BLOCK, REGION, cameras, charted, floor, floor_colours, scene
 from scenes import discs as discs_on
 
 from gimp3d.gaussians import Gaussians
 from gimp3d.geometry import window_mask
 from gimp3d.raster import footprint, render_bytes, surface_depth, touched_window
-from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
+from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Rule
-from gimp3d.steps.coverage import redrawn, still_open
-
-SETTINGS = MaskSettings()
+from gimp3d.steps.coverage import MARGIN, redrawn, still_open
 
 
 @cache
 def view() -> ViewMasks:
     """A view of the block; T is the hole in the floor under it, and the margin."""
-    seen = max(find_masks(scene(), REGION, cameras(9, 160, 120)).views, key=lambda v: int(v.target.sum()))
+    seen = max(charted(scene(), REGION, cameras(9, 160, 120)).masks.views, key=lambda v: int(v.target.sum()))
     depth, alpha = surface_depth(floor(with_hole=True), seen.camera)
     emptied = replace(seen, depth_after=depth, alpha_after=alpha)
-    side = 2 * SETTINGS.margin + 1
+    side = 2 * MARGIN + 1
     return replace(emptied, target=cv2.dilate(hole_of(emptied).astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
@@ -58,7 +56,7 @@ def patch(least_x: float = -BLOCK / 2) -> Gaussians:
 def opened(new: Gaussians, rules: np.ndarray) -> ViewMasks:
     camera = view().camera
     touched = window_mask(touched_window(new, camera), camera)
-    return still_open(view(), floor(with_hole=True).extended(new), len(new), rules, touched, SETTINGS)
+    return still_open(view(), floor(with_hole=True).extended(new), len(new), rules, touched)
 
 
 def told() -> np.ndarray:

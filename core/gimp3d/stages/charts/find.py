@@ -104,6 +104,8 @@ def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], reg
     said = ask(witnesses, points, TOLERANCE)
     share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
     near = share > HIDDEN
+    if not near.any():  # one view, or all from one place: what is beside the object is all that tells
+        near, share = np.ones(len(points), bool), np.ones(len(points))
     return _Round(points[near], eyes[near], share[near] ** 2)
 
 
@@ -112,6 +114,7 @@ def find_planes(
     witnesses: Sequence[Witness],  # of the same views
     region: Region,
     settings: ChartSettings = ChartSettings(),
+    settled: bool = True,  # by photos; else as splats draw them
 ) -> tuple[Plane, ...]:
     """The planes nearest to the surfaces that run into what the object hid.
 
@@ -136,6 +139,8 @@ def find_planes(
         sought.append((plane, left.take(on)))
         left = left.take(~on)
     all_planes = [plane for plane, _ in sought]
+    if not settled:
+        return tuple(all_planes)
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), diagonal) for plane, own in sought]
     found = [(*_settled(claim, levels), claim) for claim in claims]
     found = [
@@ -218,7 +223,7 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
         starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
         reached = [at]
-    return best, claim.at(at)
+    return best, claim.at(at) if best > 0 else claim.plane
 
 
 def _best_known(
