@@ -96,6 +96,8 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
     made: dict[str, Any] = {}
 
     def watched(stage: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
+        if stage == "seed":
+            made["target"] = inputs[0].target
         made[stage] = work(*inputs)
         return made[stage]
 
@@ -103,9 +105,8 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
     result = removal(scene, settings, reference, scene.truth(reference), observer=watched)
     spent = seconds_of(watch)
     splats = filled(scene.gaussians, result)
-    hole = next(int(v.target.sum()) for v in made["masks"].views if v.camera.id == made["reference"].camera_id)
     added = len(result.new or ())
-    row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, hole)}
+    row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, made["target"].sum())}
     row |= {"stages": {s.name: s.seconds for s in result.stages}}
     row |= spent | {"agreement": agreement(scene, splats, result)}
     return row | scores(scene, {c.id: render_bytes(splats, c) for c in scene.test[1:]}), made["masks"].removed
