@@ -107,6 +107,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
     run.references.append(choice)
     if turn.name and left_to_charts(charts, turn, settings):
+        run.warnings.append(f"--reference {turn.name}: without a picture of it, its hole is filled on charts")
         return None
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix

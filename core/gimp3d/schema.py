@@ -41,7 +41,6 @@ Positive = Annotated[float, Between(1e-9)]
 Signed = Annotated[float, Between()]
 Degrees = Annotated[float, Between(0, 180)]
 AtLeastOne = Annotated[int, Between(1, 1_000)]
-Many = Annotated[int, Between(1, 10_000_000)]
 Seed = Annotated[int, Between(0, 2**32 - 1)]
 Variant = Annotated[int, Between(0, 15)]
 SETTING = {float: Between(0, 1_000), int: Between(0, 1_000)}
