@@ -327,7 +327,7 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
     loaded = [load_view(c) for c in read_cameras(folder / "transforms.json") if c.split == "train"]
     gaussians = read_ply(folder / "scene.ply").gaussians
     region = tuple(replace(b, size=scale * b.size) for b in read_region(folder / "roi.json"))
-    masks = find_masks(gaussians, region, [c for _, c in loaded], photos={c.id: p for p, c in loaded})
+    masks = charted(gaussians, region, [c for _, c in loaded], {c.id: p for p, c in loaded}).masks
     covered = area = unseen = inner = touched = either = 0
     for view in masks.views:
         stem = folder / "truth" / "images" / Path(view.camera.id).stem
