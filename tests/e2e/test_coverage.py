@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from scenes import REGION, cameras, scene
+from scenes import REGION, cameras, charted, scene
 
 from gimp3d import filling
 from gimp3d.errors import IllPosed
 from gimp3d.evaluate.benchmark import run_benchmark
-from gimp3d.pipeline import RemovalSettings, View, remove_object, render_bytes
+from gimp3d.pipeline import PRESETS, RemovalSettings, View, remove_object, render_bytes
 
 
 def views() -> list[View]:
@@ -38,6 +38,22 @@ def test_a_negligible_hole_that_no_view_can_fill_does_not_stop_a_removal(monkeyp
     done = remove_object(scene(), views(), REGION, RemovalSettings(charts=None))
     assert done.added is None and not done.keep.all() and done.open_pixels == done.hole_pixels > 0
     assert any("no view shows it" in w for w in done.warnings) and any("stay open" in w for w in done.warnings)
+
+
+def test_a_view_that_is_named_without_a_picture_is_filled_on_charts() -> None:
+    named = cameras()[1].id
+    done = remove_object(scene(), views(), REGION, PRESETS["draft"], reference=named)
+    plain = remove_object(scene(), views(), REGION, PRESETS["draft"])
+    assert any(named in w and "filled on charts" in w for w in done.warnings)
+    assert [r.camera_id for r in done.references] == [named] and len(done.charts) == len(plain.charts) == 1
+    assert done.added is not None and plain.added is not None
+    assert done.added.means.tobytes() == plain.added.means.tobytes()
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_views_from_one_place_have_charts_too(count: int) -> None:
+    same = [replace(cameras()[1], id=f"same{k}") for k in range(count)]
+    assert charted(scene(), REGION, same).charts
 
 
 @pytest.mark.slow
