@@ -82,7 +82,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "shapes of what stays learn too": (("gimp3d.steps.relearning:LEARNED", ARRAYS),),
     "what draws other places more learns too": (("gimp3d.steps.relearning:SHARE", 0.0),),
     # into the other views
-    "no colours learned: the warp": (("propagate.transfer", "none"),),
+    "the reference's exposure stays": (("gimp3d.stages.propagate:exposure_gain", lambda *_: np.ones(3)),),
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
@@ -135,7 +135,7 @@ def main() -> None:
     names = [rule for rule in RULES if not given.rules or any(word in rule for word in given.rules)]
     scenes = read_scenes(given.data, "desk" if given.quick else given.scenes, needs_truth=True)
     if given.quick:
-        names, given.picture = ["no colours learned: the warp", "not refined"], [GIVEN]
+        names, given.picture = ["the paper's blend", "not refined"], [GIVEN]
     cells: dict[tuple[str, str, str], Row] = {}
     for scene in scenes:
         for picture in given.picture:

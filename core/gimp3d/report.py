@@ -26,7 +26,7 @@ from .stages.reference import ReferenceChoice
 
 RULE_COLOURS = {
     Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
-    Rule.OWN_PIXELS: ("this view's own pixels, mapped", (70, 120, 220)),
+    Rule.OWN_PIXELS: ("fitted to this view's own pixels, or (paper) mapped from them", (70, 120, 220)),
     Rule.RETARGETED: ("this view's own pixels, found near the mapped ones", (60, 190, 220)),
     Rule.OTHER_VIEW: ("the mapped source as another view shows it", (160, 90, 200)),
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),

@@ -51,10 +51,10 @@ def test_a_finished_cell_is_not_measured_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_learning_the_views_colours_beats_the_warp(shared_data: Path, tmp_path: Path) -> None:
+def test_a_rule_switched_off_costs_what_it_is_worth(shared_data: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "benchmarks.ablation", str(shared_data / "withwithout"), "--quick"]
     done = subprocess.run([*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     cells = {key.split(" | ")[2]: cell for key, cell in json.loads((tmp_path / "cells.json").read_text()).items()}
-    assert cells["no colours learned: the warp"]["mask"] < cells[""]["mask"] - 0.1
+    assert cells["the paper's blend"]["mask"] < cells[""]["mask"] - 0.1
     assert "| not refined |" in (tmp_path / "ablation.md").read_text()

@@ -1,7 +1,7 @@
 """From the reference into every view, by each view's own pixels (paper Algorithm 1; docs/method.md).
 
-`warp` finds where the surface that a view shows lies in the reference, `transfer` learns what differs between the two
-pictures of one surface point, `blend` fits the result to the photo round the hole. `paper` is how the paper does it.
+`warp` finds where the surface that a view shows lies in the reference, `blend` fits its colours to the photo round the
+hole. `paper` is how the paper does it.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
 from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
 from ...progress import Progress, silent
-from ...solvers.colours import NO_CHANGE
+from ...solvers.colours import exposure_gain
 from .blend import blend_band, to_bytes
 from .paper import Lent, Mapped, Sources, blend_rim, lent_colours, sampled
-from .transfer import flat, learned_change
 from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
 from .warp import Picture, picture_of, warp_reference
 
-TRANSFERS = ("learned", "sample", "none")
+TRANSFERS = ("warp", "sample")
 BLENDS = ("band", "rim")
 SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area
 LEAST_REACH = 16  # px of that
@@ -90,7 +89,7 @@ def _painted(
     lent: Sequence[Lent],
     settings: PropagateSettings,
 ) -> PaintedView:
-    """One view: what of it is photo of the new surface, the rest warped, changed and blended."""
+    """One view: what of it is photo of the new surface, the rest warped and blended."""
     if not view.target.any():
         nothing = np.zeros((0, 0, 3), np.uint8)
         return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
@@ -107,19 +106,16 @@ def _painted(
     painted, photo = hole & warp.reached, photo & warp.reached
     photo[photo] = warp.lookup(reference.source | reference.target, photo)
     rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
-    rules[painted] = Rule.OWN_PIXELS if settings.transfer == "learned" else Rule.REFERENCE
-    raw, change = warp.colours, NO_CHANGE
-    if mapped is not None:
+    rules[painted] = Rule.REFERENCE if mapped is not None else Rule.OWN_PIXELS
+    raw = warp.colours
+    if mapped is None:
+        raw = raw * exposure_gain(warp.colours[photo], base[photo]).astype(np.float32)
+    else:
         raw, rules = sampled(mapped, view, lent, warp, rules, settings.retarget)
-    elif settings.transfer == "learned":
-        alike = photo & flat(depth)
-        alike[alike] = warp.lookup(reference.source, alike)
-        change = learned_change(warp.colours, base - warp.colours, alike, hole, reach)
-        raw = warp.colours + change.of(warp.colours).astype(np.float32)
     if settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
     else:
-        blended = blend_band(base, raw, painted, photo, BAND * reach, depth, change.offset)
+        blended = blend_band(base, raw, painted, photo, BAND * reach, depth)
     rules[evidence] = Rule.EVIDENCE
     rows, cols = bounds(near.target)
     return PaintedView(

@@ -22,7 +22,6 @@ def blend_band(
     band: np.ndarray,  # [H, W] bool, photo round the hole that the fill must fit
     width: float,  # px over which the correction follows the photo; farther away it counts less
     depth: np.ndarray,  # [H, W] z of the new scene
-    offset: np.ndarray,  # [3] level of parts that no band touches
 ) -> np.ndarray:
     """The fill with a smooth correction c that fits it to the band, [H, W, 3] uint8.
 
@@ -40,7 +39,7 @@ def blend_band(
     domain = whole & ~_behind_seams(painted | band, depth)
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
-    level = _levels(domain, data, mismatch, offset)
+    level = _levels(domain, data, mismatch)
     weight, hold = 2 / width**2 * np.zeros(data.shape), (HOLD / width) ** 2
     if data.any():  # where the two show different things, the difference is none of light
         nearness = 1 / (1 + (distance[data] / width) ** 2)
@@ -49,15 +48,15 @@ def blend_band(
     correction = solve_poisson(
         domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=weight + hold, anchor=anchor
     ).values
-    correction[~domain] = offset
+    correction[~domain] = 0
     _continue_over(painted & ~domain, domain, depth, correction)
     result[painted] = to_bytes(raw[painted] + correction[painted])
     return result
 
 
-def _levels(domain: np.ndarray, data: np.ndarray, values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """[H, W, 3]: the median of each connected part's data, where there are enough of them."""
-    level = np.broadcast_to(otherwise, values.shape).astype(np.float64)
+def _levels(domain: np.ndarray, data: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """[H, W, 3]: the median of each connected part's data, where there are enough of them; else 0."""
+    level = np.zeros(values.shape)
     _, parts = cv2.connectedComponents(domain.astype(np.uint8), connectivity=4)
     found, counts = np.unique(parts[data], return_counts=True)
     for part in found[counts >= LEAST_BAND]:

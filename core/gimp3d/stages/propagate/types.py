@@ -17,8 +17,8 @@ class Rule(IntEnum):
 
     UNTOUCHED = 0
     EVIDENCE = 1  # the photo shows the new surface itself here: T reaches beyond the object
-    OWN_PIXELS = 2  # by the view's own: what they say of the reference's colours, or (paper) those at the mapped source
-    REFERENCE = 3  # the warped reference colour alone
+    OWN_PIXELS = 2  # by the view's own: fitted to those round the hole, or (paper) those at the mapped source
+    REFERENCE = 3  # the warped reference colour (paper: where nothing shows the mapped source)
     UNREACHED = 4  # the reference does not see this surface
     RETARGETED = 5  # by the view's own pixels near the mapped source, which is itself hidden or off-screen
     OTHER_VIEW = 6  # the mapped source as another view shows it
@@ -29,9 +29,8 @@ class Rule(IntEnum):
 class PropagateSettings:
     """How a view is painted: by default what was measured to be best, else as in the paper."""
 
-    # learned: the reference's colours, changed as this view's pixels tell; sample: the colours of this view's mapped
-    # sources (paper); none: the warped reference
-    transfer: Literal["learned", "sample", "none"] = "learned"  # way; the reference's texture against the view's light
+    # warp: the reference's colours; sample: the colours of this view's mapped sources (paper)
+    transfer: Literal["warp", "sample"] = "warp"  # way; the reference's texture against the view's light
     # band: fitted to the photo round the hole; rim: to the rim's pixels alone (paper)
     blend: Literal["band", "rim"] = "band"  # way; an even level against no seam at any pixel of the rim
     retarget: int = 32  # px searched round a source that is not to be seen (sample only); time against more own pixels
