@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
 from ..gaussians import SH_C0, Gaussians
-from ..geometry import Window, dilated, window_round
+from ..geometry import Window, dilated, directions, window_round
 from ..raster import label_weights, pixel_region
 from ..sh import sh_basis
-from ..srgb import decoded, encoded, linear
+from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
 from .charts.hits import Hits, first_hits, pictured
 from .ground import Ground
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow
-from .witness import Witness, total_over
+from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
@@ -30,11 +29,8 @@ PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
 MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
-BINS = 8  # of darkness, by which a Gaussian's pixels are told apart
-COARSER = 2  # times, in pictures by whose pixels it is told what shows the shadow
 LOOKS = 12  # views by which colours are corrected
-CORRECTIONS, HOLD = 3, 3.0  # steps of least squares, and px of blend weight by which lifted colours are held
-UNMIRRORING, LOOSE = 10, 0.03  # the same where a reflection goes: colours without it are farther from the old ones
+CORRECTIONS, HOLD = 10, 0.03  # steps of least squares, and px of blend weight by which the old colours are held
 SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 
 
@@ -81,9 +77,8 @@ def lift_shadow(
     """Divide linear light by the share of it that arrives, in photos and in the Gaussians that they show in shadow."""
     arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
     photos, shaded, dark, light = zip(*parallel_map(lambda p: _lifted(*p), list(zip(witnesses, arriving))))
-    rows, sh = _brighter(scene, removed, witnesses, arriving)
-    clear = [s & ~d & ~w.beside for s, d, w in zip(shaded, dark, witnesses)]
-    sh = _matched(scene, removed, rows, sh, witnesses, photos, clear)
+    clear = [s & ~d for s, d in zip(shaded, dark)]
+    rows, sh = _recoloured(scene, removed, witnesses, photos, shaded, clear, 0)
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
     before = tuple(w.photo for w in witnesses)
@@ -96,10 +91,6 @@ class Arriving:
 
     window: Window
     light: np.ndarray  # [h, w, 3] float32, the share of light that arrives at what is shown
-
-    def dimness(self) -> np.ndarray:
-        """[h, w] float32 in [0, 1]: how dark, 1 at DARKEST and below."""
-        return np.log(np.maximum(_grey(self.light), DARKEST)) / np.float32(np.log(DARKEST))
 
 
 def _grey(light: np.ndarray) -> np.ndarray:
@@ -186,91 +177,56 @@ def _mixed(witness: Witness) -> np.ndarray:
     return dilated(witness.hidden | witness.beside, 2)
 
 
-def _brighter(
-    scene: Gaussians, removed: np.ndarray, witnesses: Sequence[Witness], arriving: Sequence[Arriving]
+def _recoloured(
+    scene: Gaussians,
+    removed: np.ndarray,
+    witnesses: Sequence[Witness],
+    photos: Sequence[np.ndarray],  # as they would be
+    changed: Sequence[np.ndarray],  # [H, W] bool, where they are not as they were
+    clear: Sequence[np.ndarray],  # [H, W] bool, … and can be believed, but beside the object
+    degree: int,  # of the SH that are corrected
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [M] and new colours [M, K, 3] of the Gaussians that photos show in the shadow.
+    """Rows [M] of what shows in changed pixels, and colours [M, K, 3] by which the scene, drawn, shows the new photos.
 
-    Each by the mean of the light that arrives in the pixels that show it, by its blend weights: where it is drawn
-    tells more than where its mean lies.
+    Least squares (SIRT) over the views that show most of the change; held where photos stay as they are.
     """
     stays = np.flatnonzero(~removed)
     kept = scene.take(stays)
+    looks = sorted(range(len(changed)), key=lambda k: -int(changed[k].sum()))[:LOOKS]
+    looks = [k for k in looks if changed[k].any()]
 
-    def of(pair: tuple[Witness, Arriving]) -> np.ndarray | None:
-        witness, arriving = pair
-        dim = np.zeros(witness.hidden.shape, np.float32)
-        logs = np.zeros((*dim.shape, 3), np.float32)
-        dim[arriving.window] = arriving.dimness()
-        logs[arriving.window] = np.log(np.maximum(arriving.light, DARKEST))
-        camera = witness.camera.scaled(1 / COARSER)
-        few = np.s_[: COARSER * camera.height : COARSER, : COARSER * camera.width : COARSER]
-        dim, logs, hidden = (a[few] for a in (dim, logs, witness.hidden))
-        if not (dim > 0).any():
-            return None
-        labels = np.where(hidden, 0, 1 + np.minimum(np.ceil(dim * BINS), BINS)).astype(np.uint8)
-        count = np.bincount(labels.ravel(), minlength=BINS + 2)
-        level = np.stack([np.bincount(labels.ravel(), logs[..., k].ravel(), BINS + 2) for k in range(3)], 1)
-        level = (level / np.maximum(count, 1)[:, None])[1:]
-        weights = label_weights(kept, camera, labels, BINS + 1)
-        return np.column_stack([weights.sum(0), weights.T @ level.astype(np.float32)])
+    def shown(k: int) -> np.ndarray:
+        labels = np.where(witnesses[k].hidden, 0, 1 + changed[k]).astype(np.uint8)
+        return label_weights(kept, witnesses[k].camera, labels, 2)
 
-    total, *dimmed = total_over(list(zip(witnesses, arriving)), of, (len(kept), 4)).T
-    light = np.exp(np.stack(dimmed, 1) / np.maximum(total, 1e-9)[:, None])
-    rows = np.flatnonzero((COARSER**2 * total > SHOWN) & (light.min(1) < UNTOUCHED))
-    sh = kept.sh[rows].astype(np.float64)
-    colour = np.clip(0.5 + SH_C0 * sh[:, 0], 0.02, 1.0)
-    gain = encoded(decoded(colour) / light[rows]) / colour
-    sh[:, 0] = (gain * (0.5 + SH_C0 * sh[:, 0]) - 0.5) / SH_C0
-    sh[:, 1:] *= gain[:, None]
-    return stays[rows], sh.astype(np.float32)
-
-
-def _matched(
-    scene: Gaussians,
-    removed: np.ndarray,
-    rows: np.ndarray,
-    sh: np.ndarray,  # [M, K, 3] of these rows
-    witnesses: Sequence[Witness],
-    photos: Sequence[np.ndarray],
-    wanted: Sequence[np.ndarray],  # [H, W] bool, where they tell
-    corrections: int = CORRECTIONS,
-    hold: float = HOLD,
-    degree: int = 0,  # of the SH that are corrected
-    steady: Mapping[int, np.ndarray] = MappingProxyType({}),  # [M] by witness, blend weights in what stays as it is
-) -> np.ndarray:
-    """The colours corrected so that the scene, drawn, shows the new photos: least squares (SIRT)."""
+    weights = np.array(parallel_map(shown, looks)).reshape(-1, 2, len(kept))
+    rows = np.flatnonzero(weights[:, 1].sum(0) > SHOWN)
     if not len(rows):
-        return sh
-    others = ~removed
+        return stays[rows], scene.sh[stays[rows]]
+    others = np.ones(len(kept), bool)
     others[rows] = False
-    rest, lit = scene.take(others), replace(scene.take(rows), sh=sh)
-    looks = [(k, wanted[k]) for k in most_shown(wanted)]
-    regions = parallel_map(lambda p: pixel_region(rest, witnesses[p[0]].camera, p[1], passes=frozenset({"rgb"})), looks)
-    bands = (degree + 1) ** 2
-    means = lit.means.astype(np.float64)
-    towards = [means - witnesses[k].camera.centre for k, _ in looks]
-    bases = [sh_basis(t / np.linalg.norm(t, axis=1, keepdims=True), degree) / SH_C0 for t in towards]
-    change = np.zeros((len(rows), bands, 3))
-    for _ in range(corrections):
-        now = replace(lit, sh=(sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32))
-        asked = [(region, now, mask, photos[k]) for region, (k, mask) in zip(regions, looks)]
-        steps = parallel_map(lambda of: missing_colours(*of), asked)
-        bends = np.tile(hold * np.eye(bands), (len(rows), 1, 1))
+    rest, lit, bands = kept.take(others), kept.take(rows), (degree + 1) ** 2
+    masks = [clear[k] & ~witnesses[k].beside for k in looks]
+    cameras = [witnesses[k].camera for k in looks]
+    passes = frozenset({"rgb"})
+    regions = parallel_map(lambda p: pixel_region(rest, *p, passes=passes), list(zip(cameras, masks)))
+    bases = [sh_basis(directions(lit.means.astype(np.float64), c), degree) / SH_C0 for c in cameras]
+    change, now = np.zeros((len(rows), bands, 3)), lit
+    for _ in range(CORRECTIONS):
+        asked = [(region, now, mask, photos[k]) for region, mask, k in zip(regions, masks, looks)]
+        bends = np.tile(HOLD * np.eye(bands), (len(rows), 1, 1))
         slopes = np.zeros_like(change)
-        for (weights, missing), basis, (k, _) in zip(steps, bases, looks):
-            weight = weights[:, :1].astype(np.float64)
-            bends += ((weight + steady[k][:, None] if k in steady else weight) * basis)[:, :, None] * basis[:, None]
-            here = missing + weight * np.einsum("mk,mkc->mc", basis, change)
+        for (weight, missing), basis, steady in zip(
+            parallel_map(lambda of: missing_colours(*of), asked), bases, weights[:, 0, rows]
+        ):
+            bends += ((weight[:, :1] + steady[:, None]) * basis)[:, :, None] * basis[:, None]
+            here = missing + weight[:, :1] * np.einsum("mk,mkc->mc", basis, change)
             slopes += basis[:, :, None] * here[:, None]
         change = np.linalg.solve(bends, slopes)
-    return (sh + np.pad(change, ((0, 0), (0, sh.shape[1] - bands), (0, 0)))).astype(np.float32)
-
-
-def most_shown(wanted: Sequence[np.ndarray]) -> list[int]:
-    """The views by which colours are corrected: those that show most of what changes."""
-    order = sorted(range(len(wanted)), key=lambda k: -int(wanted[k].sum()))
-    return [k for k in order[:LOOKS] if wanted[k].any()]
+        sh = lit.sh.copy()
+        sh[:, :bands] += change
+        now = replace(lit, sh=sh)
+    return stays[rows], now.sh
 
 
 def bare_photos(
@@ -302,24 +258,10 @@ def subtract_reflection(
     """Take the mirror image's light out of photos and out of the Gaussians that they show there.
 
     Trained splats hold reflections in what lies below the surface, in how its colours change with the view, or both:
-    all of their SH are corrected, held where photos stay as they are.
+    all of their SH are corrected.
     """
     photos, changed, light = zip(*bare_photos(reflection, witnesses))
-    stays = np.flatnonzero(~removed)
-    kept = scene.take(stays)
-    looks = most_shown(changed)
-
-    def shown(k: int) -> np.ndarray:
-        labels = np.where(witnesses[k].hidden, 0, 1 + changed[k]).astype(np.uint8)
-        return label_weights(kept, witnesses[k].camera, labels, 2)
-
-    weights = dict(zip(looks, parallel_map(shown, looks)))
-    rows = np.flatnonzero(sum((w[1] for w in weights.values()), np.zeros(len(kept))) > SHOWN)
-    steady = {k: w[0, rows] for k, w in weights.items()}
-    rows = stays[rows]
-    clear = [c & ~w.beside for c, w in zip(changed, witnesses)]
-    how = (UNMIRRORING, LOOSE, scene.sh_degree, steady)
-    sh = _matched(scene, removed, rows, scene.sh[rows], witnesses, photos, clear, *how)
+    rows, sh = _recoloured(scene, removed, witnesses, photos, changed, changed, scene.sh_degree)
     dark = tuple(np.zeros_like(c) for c in changed)
     before = tuple(w.photo for w in witnesses)
     share = np.mean([c.mean() for c in changed])
