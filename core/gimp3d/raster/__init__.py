@@ -31,7 +31,7 @@ def render(
     Parameters
     ----------
     passes
-        Any of rgb, alpha, depth (both depths), expected_depth, normal and distortion; only these are computed.
+        Any of rgb, alpha, depth (both depths), expected_depth and normal; only these are computed.
 
     Returns
     -------

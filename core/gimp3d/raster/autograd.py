@@ -22,7 +22,6 @@ class Pictures:
     expected_depth: torch.Tensor | None  # [H, W]
     median_depth: torch.Tensor | None  # [H, W]
     normals: torch.Tensor | None  # [H, W, 3]
-    distortion: torch.Tensor | None  # [H, W]
 
 
 PICTURES = tuple(f.name for f in fields(Pictures))

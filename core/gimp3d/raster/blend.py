@@ -46,8 +46,8 @@ BLOCK_PX, LAST_PX = np.float32(BLOCK), np.float32(BLOCK - 1)
 # Planes of a block's state. T is the transmittance of open pixels and 0 for closed ones, whose transmittance is kept
 # in HELD with the number of list entries after which they closed in CLOSED. MEDIAN is 1 + the list entry that took T
 # below one half. The others are sums over the Gaussians, weighted with their share in the pixel.
-T, HELD, CLOSED, MEDIAN, R, G, B, Z, NX, NY, NZ, M1, M2 = range(0, 13 * 16, 16)
-PLANES = 13
+T, HELD, CLOSED, MEDIAN, R, G, B, Z, NX, NY, NZ = range(0, 11 * 16, 16)
+PLANES = 11
 BLOCK_STATE = PLANES * 16
 TILE_STATE = BLOCKS * BLOCK_STATE
 COUNTED = 48  # the first of weigh_range's planes after T, HELD and CLOSED: for each label whether pixels carry it
@@ -73,7 +73,7 @@ def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
     """U·δ, V·δ, 1 + A·δ (Huang 2024, eq. 8–11), alpha before it is capped, alpha, 1/(1 + A·δ), whether the low-pass
     decides as 1 or 0, of surfel_of a row, at offsets δ = (dx, dy)."""
     _, _, u_x, u_y, v_x, v_y, a_x, a_y = surfel
-    alpha_min, alpha_max, _, near, disc, _ = limits
+    alpha_min, alpha_max, _, near, disc = limits
     u, v = fma16(dx, u_x, dy * u_y), fma16(dx, v_x, dy * v_y)
     den = fma16(dx, a_x, fma16(dy, a_y, splat16(ONE)))
     inverse = where_greater(den, HORIZON, ONE / den, ZERO)  # no hit behind the camera
@@ -152,22 +152,22 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
 
     lists: tiles [S], how many across, the pictures' width, starts [S], stops [S], entries [P].
     given: features [N, 16 or 32]; whether of surfels; limits (alpha_min, alpha_max, stop, near, surfels' low-pass
-      factor, distortion_near); blocks to draw, wanted [S] uint64; shifts [S] float32 > 0: depths (and disparities) are
-      summed less this one, against cancellation; background [3]; what lies behind, back [S, TILE_STATE], or empty.
+      factor); blocks to draw, wanted [S] uint64; shifts [S] float32 > 0: depths are summed less this one, against
+      cancellation; background [3]; what lies behind, back [S, TILE_STATE], or empty.
     kept, out, where not empty: the blocks that each entry was blended into, masks [P] uint64; those with closing pixels
       at each check, closings [P/CHECK + S + 1] uint64; one past the last entry that was looked at, ends [S] int64
       (never empty); states [S, TILE_STATE].
-    flags [6] bool: with rgb, expected depth, median depth, normals, distortion; and in place of the median depth,
-      1 + its Gaussian's row as int32 bits.
+    flags [5] bool: with rgb, expected depth, median depth, normals; and in place of the median depth, 1 + its
+      Gaussian's row as int32 bits.
     front [S, TILE_STATE]: what lies before the entries, or empty.
-    pictures, out: rgb [3 W H], alpha, expected, median [W H], normals [3 W H], distortion [W H], flat, W = width and H
-      rounded up to whole blocks; empty where not asked for.
+    pictures, out: rgb [3 W H], alpha, expected, median [W H], normals [3 W H], flat, W = width and H rounded up to
+      whole blocks; empty where not asked for.
     """
     tiles, across, _, starts, stops, entries = lists
     features, surfels, limits, wanted, shifts, _, _ = given
     masks, closings, ends, states = kept
-    _, _, stop, _, _, distortion_near = limits
-    with_rgb, with_depth, with_median, with_normals, with_distortion, _ = flags
+    stop = limits[2]
+    with_rgb, with_depth, with_median, with_normals, _ = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
     column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
     own_state, covers = aligned_empty(TILE_STATE), np.empty(CHECK, np.uint64)
@@ -183,7 +183,6 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
                     store16(state, b * BLOCK_STATE + 16 * plane, none)
                 store16(state, b * BLOCK_STATE + T, one)
         alive, shift = wanted[slot], shifts[slot]
-        disparity_shift = distortion_near / shift
         if len(front):
             alive = _open(state, alive, stop)
         first, end, i = starts[slot], stops[slot], starts[slot]
@@ -199,12 +198,11 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
             if surfels:
                 surfel = surfel_of(flat, o)
                 x, y = float32(left) + HALF - surfel[0], float32(top) + HALF - surfel[1]
-                disparity = distortion_near / depth
                 while mask:
                     b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    _, _, den, _, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
+                    _, _, _, _, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     before = load16(state, k + T)
                     weight = alpha * before
                     after = before - weight
@@ -218,14 +216,10 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
                         _mark_median(state, k, before, after, number)
                     if with_normals:
                         _add_three(state, k + NX, weight, nx, ny, nz)
-                    if with_distortion:
-                        m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
-                        _add_disparity(state, k, weight, m)
             else:
                 x, y, xx, xy, yy = ellipse_of(flat, o)
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 along0, down0 = fma16(column, xx, row * xy), row * yy
-                m = splat16(distortion_near / depth - disparity_shift)
                 while mask:
                     b, mask = next_bit(mask)
                     k = b * BLOCK_STATE
@@ -244,8 +238,6 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
                         _mark_median(state, k, before, after, number)
                     if with_normals:
                         _add_three(state, k + NX, weight, nx, ny, nz)
-                    if with_distortion:
-                        _add_disparity(state, k, weight, m)
             i += 1
             if (i - first) % CHECK == 0:
                 alive, closing = _close(state, BLOCK_STATE, alive, float32(i - first), stop)
@@ -271,13 +263,6 @@ def _mark_median(state, k, before, after, number):
 
 
 @inline_kernel
-def _add_disparity(state, k, weight, m):
-    moment = weight * m
-    store16(state, k + M1, load16(state, k + M1) + moment)
-    store16(state, k + M2, fma16(moment, m, load16(state, k + M2)))
-
-
-@inline_kernel
 def total(state, back, slot, k, plane, clear):
     """A weighted sum of the whole ray: what the state holds, and what shines through it from the layer behind."""
     own = load16(state, k + plane)
@@ -299,7 +284,7 @@ def _finish(state, left, top, slot, lists, given, flat, flags, pictures):
     _, _, width, starts, _, entries = lists
     features, surfels, limits, wanted, shifts, background, back = given
     first, row_size, shift = starts[slot], int64(features.shape[1]), shifts[slot]
-    rgb, alpha, expected, median, normals, distortion = pictures
+    rgb, alpha, expected, median, normals = pictures
     depths = np.empty(16, np.float32)
     numbers = depths.view(np.int32)
     mask = wanted[slot]
@@ -326,7 +311,7 @@ def _finish(state, left, top, slot, lists, given, flat, flags, pictures):
             for lane in range(16):
                 number = int64(load1(state, k + MEDIAN + lane))
                 depths[lane] = ZERO
-                if number > 0 and flags[5]:
+                if number > 0 and flags[4]:
                     numbers[lane] = entries[first + number - 1] + 1
                 elif number > 0:
                     at = int64(entries[first + number - 1]) * row_size
@@ -335,9 +320,6 @@ def _finish(state, left, top, slot, lists, given, flat, flags, pictures):
         if flags[3]:
             nx, ny, nz, inverse = total_normal(state, back, slot, k, clear)
             store_block3(normals, 3 * o, 3 * width, nx * inverse, ny * inverse, nz * inverse)
-        if flags[4]:
-            m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
-            store_block(distortion, o, width, max16(weight * m2 - m1 * m1, ZERO))
 
 
 @inline_kernel

@@ -26,8 +26,8 @@ FRUSTUM_MARGIN = 0.3  # the Jacobian is evaluated no further out than 1.3 × the
 Flags = tuple[bool, ...]  # blend_range's
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
-NO_PICTURES = (np.empty(0, np.float32),) * 6
-CHANNELS = (3, 1, 1, 1, 3, 1)  # of rgb, alpha, expected depth, median depth, normals, distortion
+NO_PICTURES = (np.empty(0, np.float32),) * 5
+CHANNELS = (3, 1, 1, 1, 3)  # of rgb, alpha, expected depth, median depth, normals
 
 
 def project(
@@ -86,13 +86,13 @@ def pass_flags(passes: frozenset[str]) -> Flags:
     if unknown := passes - PASSES:
         raise ValueError(f"unknown passes {sorted(unknown)}; there are {sorted(PASSES)}")
     either_depth = bool(passes & {"depth", "expected_depth"})
-    return ("rgb" in passes, either_depth, "depth" in passes, "normal" in passes, "distortion" in passes, False)
+    return ("rgb" in passes, either_depth, "depth" in passes, "normal" in passes, False)
 
 
 def pack_limits(settings: RasterSettings) -> tuple[np.float32, ...]:
     """blend_range's limits."""
     disc = HALF_LOG2E / settings.surfel_low_pass
-    limits = (settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc, settings.distortion_near)
+    limits = (settings.alpha_min, settings.alpha_max, settings.stop, settings.near, disc)
     return tuple(np.float32(value) for value in limits)
 
 
@@ -167,8 +167,8 @@ class Trace:
             if picture.size and picture.shape != expected:
                 raise ValueError(f"gradient of {name}: expected shape {expected}, got {picture.shape}")
         given = tuple(padded(picture, camera) for picture in pictures.values())
-        flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4, 5))
-        names = ("rgb", "expected_depth", "median_depth", "normals", "distortion")
+        flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4))
+        names = ("rgb", "expected_depth", "median_depth", "normals")
         missing = [name for name, wanted, drawn in zip(names, flags, self.flags) if wanted and not drawn]
         if missing:
             raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
@@ -219,15 +219,13 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
         np.empty((slots if keep else 0, TILE_STATE), np.float32),
     )
     (height, width), flags = padded_size(traced.camera), traced.flags
-    wanted = (flags[0], True, flags[1], flags[2], flags[3], flags[4])
+    wanted = (flags[0], True, flags[1], flags[2], flags[3])
     pictures = tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
     over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, flags, front, pictures)
     shapes = [(height, width, c) if w else (0, 0, c) for w, c in zip(wanted, CHANNELS)]
     cut = [p.reshape(shape)[: traced.camera.height, : traced.camera.width] for p, shape in zip(pictures, shapes)]
     cut = [np.ascontiguousarray(p if p.shape[2] == 3 else p[..., 0]) for p in cut]
-    rgb, alpha, expected, median, normals, distortion = cut
-    drawn = Rendering(rgb, alpha, expected, median, normals, distortion, traced.view.ignored)
-    return drawn, replace(traced, kept=kept)
+    return Rendering(*cut, traced.view.ignored), replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:

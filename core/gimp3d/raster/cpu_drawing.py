@@ -17,7 +17,7 @@ from .project import BLUE, RED
 from .surface import meet_range
 from .types import Mask, RasterSettings, Rendering
 
-NUMBERS_ONLY = (False, False, True, False, False, True)  # blend_range's flags
+NUMBERS_ONLY = (False, False, True, False, True)  # blend_range's flags
 
 
 class CpuDrawing:
@@ -27,7 +27,7 @@ class CpuDrawing:
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
     ) -> None:
         self.gaussians, self.camera, self.with_colour = gaussians, camera, with_colour
-        flags = (with_colour, False, False, False, False, False)
+        flags = (with_colour, False, False, False, False)
         self._made = cpu.prepare(gaussians, camera, settings, flags, pixels, with_records=False)
 
     def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:

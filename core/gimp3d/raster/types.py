@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry import Window as Window
 
 Mask = np.ndarray | None  # bool, of a picture's pixels [H, W] or a scene's rows [N]; None: all
-PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal", "distortion"})
+PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal"})
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})  # what a picture usually needs
 
 
@@ -25,7 +25,6 @@ class RasterSettings:
     alpha_min: float = 1 / 255  # > 0; a Gaussian is nothing where its alpha is not above this
     alpha_max: float = 0.99
     stop: float = 1e-4  # transmittance below which a pixel takes no more Gaussians (looked at every 16)
-    distortion_near: float = 0.2  # distortion compares distortion_near / z (Huang 2024's NDC depth with far → ∞)
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,6 @@ class Rendering:
     expected_depth: np.ndarray  # [H, W] float32, Σ w z / Σ w; 0 where there is nothing
     median_depth: np.ndarray  # [H, W] float32, z of the Gaussian that blocks half of the light; 0 where alpha < 0.5
     normals: np.ndarray  # [H, W, 3] float32, unit, camera axes, facing the camera; 0 where there is nothing
-    distortion: np.ndarray  # [H, W] float32, Σ_{i<j} w_i w_j (m_i − m_j)², m = distortion_near / z
     ignored: int  # rows that cannot be drawn: broken geometry, or in the picture with broken SH coefficients
 
 
@@ -54,7 +52,6 @@ class PictureGradients:
     expected_depth: np.ndarray = _nothing()
     median_depth: np.ndarray = _nothing()
     normals: np.ndarray = _nothing(3)
-    distortion: np.ndarray = _nothing()
 
 
 @dataclass(frozen=True)

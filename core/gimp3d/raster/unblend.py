@@ -38,8 +38,6 @@ from .blend import (
     CHECK,
     CLOSED,
     HELD,
-    M1,
-    M2,
     MEDIAN,
     NOTHING,
     NX,
@@ -58,8 +56,8 @@ RECORD = 16
 
 # Planes of a block on the way back: T, which is 0 until a closed pixel is opened again; what lies behind, now and at
 # the START; gradients with respect to the sums of the same name and the sum of weights; the median's, and its entry.
-BEHIND, G_W, G_R, G_G, G_B, G_Z, G_MEDIAN, MEDIAN_ENTRY, G_NX, G_NY, G_NZ, G_M1, G_M2, START = range(16, 15 * 16, 16)
-BACK_STATE = 15 * 16
+BEHIND, G_W, G_R, G_G, G_B, G_Z, G_MEDIAN, MEDIAN_ENTRY, G_NX, G_NY, G_NZ, START = range(16, 13 * 16, 16)
+BACK_STATE = 13 * 16
 TWICE_LN2, TWO = np.float32(2 * LN2), np.float32(2)
 
 
@@ -69,20 +67,19 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
     which are frozen.
 
     `lists` and `given` are those of blend_range, `kept` is what it left; `gradients` lie as its pictures do, empty
-    where not given; `flags` [5] bool: which of rgb, expected depth, median depth, normals and distortion are.
+    where not given; `flags` [4] bool: which of rgb, expected depth, median depth and normals are.
     """
     tiles, across, width, starts, stops, entries = lists
     features, surfels, limits, wanted, shifts, background, back = given
     masks, closings, ends, states = kept
-    _, alpha_max, _, _, disc, distortion_near = limits
-    with_rgb, with_depth, with_median, with_normals, with_distortion = flags
+    _, alpha_max, _, _, disc = limits
+    with_rgb, with_depth, with_median, with_normals = flags
     flat, row_size = features.reshape(-1), int64(features.shape[1])
-    column, row, none, one = columns16(), rows16(), splat16(ZERO), splat16(ONE)
+    column, row, none = columns16(), rows16(), splat16(ZERO)
     work = aligned_empty(BLOCKS * BACK_STATE)
     for slot in slots:
         left, top = (tiles[slot] % across) * TILE, (tiles[slot] // across) * TILE
         state, shift = states[slot], shifts[slot]
-        disparity_shift = distortion_near / shift
         first, end = starts[slot], stops[slot]
         _prepare(state, work, wanted[slot], left, top, width, flags, background, back, slot, gradients)
         for i in range(ends[slot], end):
@@ -104,15 +101,13 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                 surfel = surfel_of(flat, o)
                 x, y, u_x, u_y, v_x, v_y, a_x, a_y = surfel
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
-                disparity = distortion_near / depth
                 s_ux, s_uy, s_vx, s_vy, s_ax, s_ay, s_cx, s_cy = none, none, none, none, none, none, none, none
                 while mask:
                     b, mask = next_bit(mask)
                     k = b * BACK_STATE
                     dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    u, v, den, free, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
+                    u, v, _, free, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
                     z = where_greater(blurred, ZERO, splat16(depth), inverse * depth) - shift
-                    m = where_greater(blurred, ZERO, one, den) * disparity - disparity_shift
                     value = load16(work, k + G_W)
                     if with_rgb:
                         value = _three(work, k, G_R, red, green, blue, value)
@@ -120,8 +115,6 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                         value = fma16(load16(work, k + G_Z), z, value)
                     if with_normals:
                         value = _three(work, k, G_NX, nx, ny, nz, value)
-                    if with_distortion:
-                        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
                     weight, p = _step(work, k, alpha, value)
                     if active:
                         if with_rgb:
@@ -130,23 +123,18 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                             s_nx, s_ny, s_nz = _add_three(work, k, G_NX, weight, s_nx, s_ny, s_nz)
                         p = where_greater(free, alpha_max, ZERO, p)
                         s_log = s_log + p
-                        # what moves 1 + A·δ: the depth of the ray, and the distortion
-                        d_z, d_m = none, none
+                        d_z = none
                         if with_depth:
                             d_z = weight * load16(work, k + G_Z)
                         if with_median:
                             d_z = d_z + _median_gradient(work, k, number)
-                        if with_distortion:
-                            d_m = weight * fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
                         d_inverse = d_z * depth
-                        d_den = d_m * disparity
                         s_depth = s_depth + where_greater(blurred, ZERO, d_z, d_z * inverse)
-                        s_depth = s_depth - d_m * (disparity / depth) * where_greater(blurred, ZERO, one, den)
                         # ln alpha = ln opacity − ln 2 ((U·δ)² + (V·δ)²) / (1 + A·δ)²
                         p_ray = where_greater(blurred, ZERO, ZERO, p) * TWICE_LN2
                         d_u, d_v = ZERO - p_ray * u * inverse * inverse, ZERO - p_ray * v * inverse * inverse
                         d_inverse = d_inverse - p_ray * fma16(u, u, v * v) * inverse
-                        d_a = where_greater(blurred, ZERO, ZERO, d_den - d_inverse * inverse * inverse)
+                        d_a = where_greater(blurred, ZERO, ZERO, ZERO - d_inverse * inverse * inverse)
                         s_ux, s_uy = fma16(d_u, dx, s_ux), fma16(d_u, dy, s_uy)
                         s_vx, s_vy = fma16(d_v, dx, s_vx), fma16(d_v, dy, s_vy)
                         s_ax, s_ay = fma16(d_a, dx, s_ax), fma16(d_a, dy, s_ay)
@@ -163,9 +151,8 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                 x, y, xx, xy, yy = ellipse_of(flat, o)
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 along0, down0 = fma16(column, xx, row * xy), row * yy
-                disparity = distortion_near / depth
-                z, m = splat16(depth - shift), splat16(disparity - disparity_shift)
-                q, q_x, q_y, q_xx, q_xy, q_yy, s_m = none, none, none, none, none, none, none
+                z = splat16(depth - shift)
+                q, q_x, q_y, q_xx, q_xy, q_yy = none, none, none, none, none, none
                 while mask:
                     b, mask = next_bit(mask)
                     k = b * BACK_STATE
@@ -179,8 +166,6 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                         value = fma16(load16(work, k + G_Z), z, value)
                     if with_normals:
                         value = _three(work, k, G_NX, nx, ny, nz, value)
-                    if with_distortion:
-                        value = fma16(fma16(load16(work, k + G_M2), m, load16(work, k + G_M1)), m, value)
                     weight, p = _step(work, k, alpha, value)
                     if active:
                         if with_rgb:
@@ -191,9 +176,6 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                             s_depth = fma16(weight, load16(work, k + G_Z), s_depth)
                         if with_median:
                             s_depth = s_depth + _median_gradient(work, k, number)
-                        if with_distortion:
-                            d_m = fma16(load16(work, k + G_M2) * TWO, m, load16(work, k + G_M1))
-                            s_m = fma16(weight, d_m, s_m)
                         p = where_greater(free, alpha_max, ZERO, p)
                         # Moments about the block's corner: the offset within it is the same for all blocks.
                         p_x, p_y = p * dx, p * dy
@@ -203,7 +185,6 @@ def unblend_range(slots, lists, given, kept, flags, gradients, first_active, rec
                     s_xx = fma16(column, fma16(column, q, TWO * q_x), q_xx)
                     s_xy = fma16(column, fma16(row, q, q_y), fma16(row, q_x, q_xy))
                     s_yy = fma16(row, fma16(row, q, TWO * q_y), q_yy)
-                    s_depth = s_depth - s_m * (disparity / depth)
                     sums = sums16(
                         s_red, s_green, s_blue, s_depth, q, fma16(column, q, q_x), fma16(row, q, q_y), s_xx, s_xy, s_yy,
                         none, none, none, s_nx, s_ny, s_nz,
@@ -261,7 +242,7 @@ def _reopen(state, work, mask, entry):
 @inline_kernel
 def _prepare(state, work, mask, left, top, width, flags, background, back, slot, gradients):
     """The pixels' gradients with respect to the sums over Gaussians, from those of the pictures."""
-    d_rgb, d_alpha, d_expected, d_median, d_normals, d_distortion = gradients
+    d_rgb, d_alpha, d_expected, d_median, d_normals = gradients
     while mask:
         b, mask = next_bit(mask)
         k, w = b * BLOCK_STATE, b * BACK_STATE
@@ -293,12 +274,6 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
             store16(work, w + G_NX, (g_x - along * nx) * inverse)
             store16(work, w + G_NY, (g_y - along * ny) * inverse)
             store16(work, w + G_NZ, (g_n - along * nz) * inverse)
-        if flags[4]:
-            g = load_block(d_distortion, o, width)
-            m1, m2 = total(state, back, slot, k, M1, clear), total(state, back, slot, k, M2, clear)
-            store16(work, w + G_M1, ZERO - g * m1 * TWO)
-            store16(work, w + G_M2, g * weight)
-            g_w = fma16(g, m2, g_w)
         store16(work, w + G_W, g_w)
         if len(back):
             # the layer behind is one Gaussian of alpha 1 − T whose value is that of its sums
@@ -312,9 +287,6 @@ def _prepare(state, work, mask, left, top, width, flags, background, back, slot,
             if flags[3]:
                 for c in range(3):
                     behind = fma16(load16(work, w + G_NX + 16 * c), load16(back[slot], k + NX + 16 * c), behind)
-            if flags[4]:
-                behind = fma16(load16(work, w + G_M1), load16(back[slot], k + M1), behind)
-                behind = fma16(load16(work, w + G_M2), load16(back[slot], k + M2), behind)
         store16(work, w + BEHIND, behind)
         store16(work, w + START, behind)
         store16(work, w + T, load16(state, k + T))

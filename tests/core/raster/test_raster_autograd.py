@@ -64,7 +64,7 @@ def assert_same(parameters: list[torch.Tensor], gradients: Gradients) -> None:
         np.testing.assert_array_equal(parameter.grad.numpy(), getattr(gradients, name), err_msg=name)
 
 
-@pytest.mark.parametrize("passes", [PASSES, frozenset({"rgb"}), frozenset({"expected_depth", "distortion"})])
+@pytest.mark.parametrize("passes", [PASSES, frozenset({"rgb"}), frozenset({"expected_depth", "normal"})])
 def test_pictures_and_gradients_are_those_of_the_arrays(gaussians: Gaussians, passes: frozenset[str]) -> None:
     parameters = tensors(gaussians)
     drawn = rasterize(*parameters, CAMERA, BACKGROUND, passes, gaussians.antialiased)
@@ -176,7 +176,7 @@ class FakeBackend:
     ) -> Rendering:
         self.seen.append(gaussians)
         size = (camera.height, camera.width)
-        shapes = ((*size, 3), size, size, (0, 0), (*size, 3), size)
+        shapes = ((*size, 3), size, size, (0, 0), (*size, 3))
         return Rendering(*(np.full(s, 7, np.float32) for s in shapes), 5)
 
     def trace(

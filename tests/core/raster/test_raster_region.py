@@ -32,7 +32,6 @@ PICTURES = {  # passes that layers can do
     "alpha": "alpha",
     "expected_depth": "expected_depth",
     "normals": "normal",
-    "distortion": "distortion",
 }
 LAYERED = frozenset(PICTURES.values())
 EXACT = RasterSettings(background=(0.1, 0.2, 0.3), stop=1e-12)
@@ -84,9 +83,8 @@ def assert_shows(
             # opposite normals may all but cancel, and then the sum has no direction
             differs = np.abs(actual - expected)[where] > 100 * atol * (1 + np.abs(expected[where]))
             assert differs.mean() < 0.005 if differs.size else True, name
-        else:  # a distortion is a difference of larger numbers
-            most = 20 * atol if name == "distortion" else atol
-            np.testing.assert_allclose(actual[inside], expected[inside], rtol=1e-5, atol=most, err_msg=name)
+        else:
+            np.testing.assert_allclose(actual[inside], expected[inside], rtol=1e-5, atol=atol, err_msg=name)
 
 
 def upstream(camera: Camera, names: list[str], pixels: np.ndarray, seed: int = 0) -> PictureGradients:
@@ -230,7 +228,7 @@ def test_any_number_of_active_gaussians_anywhere(seed: int, surfels: bool, steps
         active = active_scene(seed, surfels, count)
         active = replace(active, means=active.means + np.float32([0, 0, shift]))
         whole = render(frozen.extended(active), CAMERA, EXACT, LAYERED)
-        assert_shows(region.render(active), whole, pixels, 3e-6, ["rgb", "alpha", "distortion"])
+        assert_shows(region.render(active), whole, pixels, 3e-6, ["rgb", "alpha"])
 
 
 @pytest.mark.parametrize("surfels", [False, True])

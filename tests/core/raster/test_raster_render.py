@@ -174,7 +174,7 @@ def test_colours_may_exceed_one_but_not_fall_below_zero() -> None:
 
 @pytest.mark.parametrize(
     "wanted",
-    [set(), {"rgb"}, {"alpha"}, {"depth"}, {"expected_depth"}, {"normal"}, {"distortion"}, {"alpha", "depth"}],
+    [set(), {"rgb"}, {"alpha"}, {"depth"}, {"expected_depth"}, {"normal"}, {"alpha", "depth"}],
 )
 @pytest.mark.parametrize("surfels", [False, True])
 def test_a_pass_is_the_same_alone_as_with_the_others(surfels: bool, wanted: set[str]) -> None:
@@ -185,7 +185,6 @@ def test_a_pass_is_the_same_alone_as_with_the_others(surfels: bool, wanted: set[
         "expected_depth": {"depth", "expected_depth"},
         "median_depth": {"depth"},
         "normals": {"normal"},
-        "distortion": {"distortion"},
     }
     np.testing.assert_array_equal(some.alpha, everything.alpha)
     for field, names in passes.items():
@@ -196,15 +195,6 @@ def test_a_pass_is_the_same_alone_as_with_the_others(surfels: bool, wanted: set[
         assert getattr(everything, field).any()
 
 
-def test_distortion_is_that_of_pairs_of_weights_and_depths() -> None:
-    """Two facing Gaussians on the optical axis: w₁ w₂ (n/z₁ − n/z₂)²."""
-    both = one((0, 0, 2.0), 0.3, 0.0).extended(one((0, 0, 5.0), 0.5, 0.0))
-    raster = RasterSettings(distortion_near=0.7)
-    drawn = render(both, CAMERA, raster, frozenset({"distortion"})).distortion[14, 20]
-    assert drawn == pytest.approx(0.5 * 0.25 * (0.7 / 2 - 0.7 / 5) ** 2, rel=1e-4)
-    assert render(both.take(np.array([0])), CAMERA, raster, PASSES).distortion.max() < 1e-8
-
-
 def test_an_unknown_pass_is_named() -> None:
-    with pytest.raises(ValueError, match=r"colour.*alpha.*depth.*distortion.*expected_depth.*normal.*rgb"):
+    with pytest.raises(ValueError, match=r"colour.*alpha.*depth.*expected_depth.*normal.*rgb"):
         render(one(), CAMERA, passes=ALL_PASSES | {"colour"})

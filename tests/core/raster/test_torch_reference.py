@@ -17,14 +17,14 @@ from gimp3d.raster import RasterSettings
 torch = pytest.importorskip("torch")
 from torch_reference import Pictures, draw  # noqa: E402 (needs torch)
 
-DIFFERENTIABLE = ["rgb", "alpha", "expected_depth", "median_depth", "normals", "distortion"]
+DIFFERENTIABLE = ["rgb", "alpha", "expected_depth", "median_depth", "normals"]
 PARAMETERS = ["means", "log_scales", "quats", "opacity_logits", "sh"]
 
 
 def settings(**changes: object) -> SimpleNamespace:
     """RasterSettings and what surfels need besides."""
     common = vars(RasterSettings(background=(0.1, 0.2, 0.3)))
-    return SimpleNamespace(**{**common, "surfel_low_pass": 0.5, "distortion_near": 0.2, **changes})
+    return SimpleNamespace(**{**common, "surfel_low_pass": 0.5, **changes})
 
 
 def tensors(gaussians: Gaussians) -> list:
@@ -112,20 +112,6 @@ def test_gradients_are_finite_and_rows_behind_the_camera_have_none(surfels: bool
         assert (parameter.grad[behind] == 0).all()
         assert (parameter.grad != 0).any()
     assert (drawn.weights[:, :, behind] == 0).all()
-
-
-@pytest.mark.parametrize("surfels", [False, True])
-def test_distortion_is_the_sum_over_pairs(surfels: bool) -> None:
-    gaussians = random_scene(6, 20, surfels=surfels)
-    drawn = pictures(gaussians)
-    weights = drawn.weights.detach().numpy()
-    expected = np.zeros(weights.shape[:2])
-    m = [0.2 / depth_where_drawn(gaussians, row) for row in range(20)]
-    for j in range(20):
-        for i in range(j):
-            expected += weights[..., i] * weights[..., j] * (m[i] - m[j]) ** 2
-    np.testing.assert_allclose(drawn.distortion.detach().numpy(), expected, rtol=1e-9, atol=1e-14)
-    assert expected.max() > 1e-4
 
 
 def depth_where_drawn(gaussians: Gaussians, row: int) -> np.ndarray:

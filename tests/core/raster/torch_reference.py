@@ -31,7 +31,6 @@ class Pictures:
     expected_depth: Tensor  # [H, W]
     median_depth: Tensor  # [H, W]
     normals: Tensor  # [H, W, 3]
-    distortion: Tensor  # [H, W]
     doubtful: Tensor  # [H, W] bool: some decision is within rounding of its threshold
     weights: Tensor  # [H, W, N] blend weights
 
@@ -92,16 +91,12 @@ def draw(
     normal_sum = weights @ normals
     clear = ((normal_sum**2).sum(-1, keepdim=True) > NOTHING**2).expand_as(normal_sum)
     unit = torch.nn.functional.normalize(torch.where(clear, normal_sum, 1.0), dim=-1)
-    m = settings.distortion_near / depth
-    # Σ_{i<j} w_i w_j (m_i − m_j)², which is symmetric in i and j, hence half the sum over all pairs
-    distortion = total * (weights * m**2).sum(-1) - (weights * m).sum(-1) ** 2
     return Pictures(
         rgb=weights @ colours + light[..., -1:] * background,
         alpha=total,
         expected_depth=torch.where(something, mean_depth, 0.0),
         median_depth=torch.where((before > 0.5) & (after <= 0.5), depth, 0.0).sum(-1),
         normals=torch.where(clear, unit, 0.0),
-        distortion=distortion,
         doubtful=doubt.any(-1),
         weights=torch.zeros(*weights.shape[:2], len(means), dtype=torch.float64).index_copy(2, order, weights),
     )
