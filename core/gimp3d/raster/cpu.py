@@ -225,7 +225,8 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
     shapes = [(height, width, c) if w else (0, 0, c) for w, c in zip(wanted, CHANNELS)]
     cut = [p.reshape(shape)[: traced.camera.height, : traced.camera.width] for p, shape in zip(pictures, shapes)]
     cut = [np.ascontiguousarray(p if p.shape[2] == 3 else p[..., 0]) for p in cut]
-    return Rendering(*cut, traced.view.ignored), replace(traced, kept=kept)
+    rgb, alpha, expected, median, normals = cut
+    return Rendering(rgb, alpha, expected, median, normals, traced.view.ignored), replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:
