@@ -82,7 +82,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "shapes of what stays learn too": (("gimp3d.steps.relearning:LEARNED", ARRAYS),),
     "what draws other places more learns too": (("gimp3d.steps.relearning:SHARE", 0.0),),
     # into the other views
-    "the reference's exposure stays": (("gimp3d.stages.propagate:exposure_gain", lambda *_: np.ones(3)),),
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),

@@ -187,9 +187,11 @@ def test_views_are_let_go_once_they_are_painted(reference: Reference) -> None:
     assert kept < 8 * 7 * 90 * 120
 
 
-def test_exposure_of_the_view_is_met(reference: Reference) -> None:
+def test_the_level_of_the_view_is_met(reference: Reference) -> None:
+    """Light, that is: exposures are levelled before (`stages.exposure`)."""
+
     def darker(colours: np.ndarray) -> np.ndarray:
-        return 0.7 * colours
+        return colours - 30
 
     target = view(reference, 2, darker)
     _, image, rules = paint(reference, target)
@@ -197,11 +199,11 @@ def test_exposure_of_the_view_is_met(reference: Reference) -> None:
     assert error(image, target, hole, darker) < 6
 
 
-def test_exposure_is_met_where_the_hole_touches_no_photo(reference: Reference) -> None:
+def test_the_level_is_met_where_the_hole_touches_no_photo(reference: Reference) -> None:
     """A part of the hole that only renderings surround takes the level that the rest of the view tells."""
 
     def darker(colours: np.ndarray) -> np.ndarray:
-        return 0.6 * colours
+        return colours - 40
 
     target = view(reference, 2, darker)
     grown = np.zeros_like(target.silhouette)

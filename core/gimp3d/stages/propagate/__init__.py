@@ -17,7 +17,6 @@ from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
 from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
 from ...progress import Progress, silent
-from ...solvers.colours import exposure_gain
 from .blend import blend_band, to_bytes
 from .paper import Lent, Mapped, Sources, blend_rim, lent_colours, sampled
 from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
@@ -108,9 +107,7 @@ def _painted(
     rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
     rules[painted] = Rule.REFERENCE if mapped is not None else Rule.OWN_PIXELS
     raw = warp.colours
-    if mapped is None:
-        raw = raw * exposure_gain(warp.colours[photo], base[photo]).astype(np.float32)
-    else:
+    if mapped is not None:
         raw, rules = sampled(mapped, view, lent, warp, rules, settings.retarget)
     if settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
