@@ -201,7 +201,7 @@ def chart_targets(
         gone_from = hidden | touched
         target = (hidden & unseen & ~before) | (gone_from & bare & (view.alpha_before >= SURFACE))
         target = dilated(cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3))), RIM)
-        target &= met & ~before & gone_from
+        target &= met & ~before & gone_from & ~view.occluder
         return replace(
             view,
             silhouette=hidden | witnesses[k].beside,

@@ -15,6 +15,7 @@ from ..raster import drawing, touched_window
 from .outline import box_polygon, fill_polygon
 
 AROUND = 24  # px round what the object touched that are drawn anew without it: depths and edges there are looked at too
+MOSTLY_OBJECT = 0.5  # blend weight of removed Gaussians above which a pixel shows the object and not what surrounds it
 NEAR_PLANE = 1e-3  # z below which a box is cut away, as a share of its diagonal
 MISFIT = 4.0  # a photo is not what the scene shows where they differ by so many times the view's median …
 LEAST_MISFIT = 0.1  # … and by so much, colours in [0, 1]

@@ -17,13 +17,12 @@ from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
-from ..geometry import bounds
+from ..geometry import bounds, dilated
 from ..progress import Progress, silent
-from ..raster import render
 from .growth import NOTHING, Growth
-from .look import ViewAfter, ViewBefore, look, look_without, outlines
-from .outline import guard_gaussians
+from .look import MOSTLY_OBJECT, ViewAfter, ViewBefore, look, look_without, outlines
 from .selection import Selection, SelectionSettings, by_centre, choose, select_removed
+from .targets import CHANGED, in_front, uncovered
 from .visibility import depth_agreement
 
 T = TypeVar("T")
@@ -31,8 +30,6 @@ R = TypeVar("R")
 # Share of surface that two views of a good scan place alike; of scenes below it, photos must vouch for more of what the
 # removal reveals: 9 to 26 more smears go from real_bed, real_table and tiles_mug.
 USUAL_AGREEMENT = 0.97
-GUARD_FOOTPRINT = 0.5  # accumulated alpha of guard Gaussians above which a pixel needs no fill (paper 3.2)
-CHANGED = 0.02  # blend weight of removed Gaussians above which the object touched a pixel: five grey levels of 255
 LEAST_AGREEMENT = 0.5  # share of surface that two views must place alike, else the mode is "paper": the majority
 LEAST_LIKENESS = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
 
@@ -77,6 +74,7 @@ class ViewMasks:
     camera: Camera
     polygon: _Part = _Part()  # bool, the projected boxes
     silhouette: _Part = _Part()  # bool, pixels that the removed Gaussians touched, and those of the extra mask
+    occluder: _Part = _Part()  # bool, kept surfaces in front of the object, at its outline
     target: _Part = _Part()  # bool, T: the pixels to fill
     depth_before: np.ndarray  # type: ignore[misc]  # float32 z with the object, 0 = nothing, or nothing to be trusted
     alpha_before: np.ndarray  # type: ignore[misc]  # float32
@@ -166,8 +164,8 @@ def find_masks(
         mode = "paper"
 
     def masked(both: tuple[ViewBefore, ViewAfter]) -> ViewMasks:
-        hole = _uncovered(gaussians, selection.removed, both[0]) if mode == "paper" else None
-        return _view_masks(*both, hole)
+        hole = uncovered(gaussians, selection.removed, both[0]) if mode == "paper" else None
+        return _view_masks(*both, hole, not warnings)
 
     views = tuple(parallel_map(masked, list(zip(before, after))))
     reason = f"{selection.words}; {len(views)} views see the region"
@@ -229,20 +227,19 @@ def _inconsistencies(before: Sequence[ViewBefore], agreement: float) -> tuple[st
     return tuple(found)
 
 
-def _uncovered(gaussians: Gaussians, removed: np.ndarray, view: ViewBefore) -> np.ndarray:
-    """[H, W] bool: T as the paper defines it (3.2), the polygon less the guard Gaussians' footprints."""
-    usable = ~removed & gaussians.usable
-    guards = [guard_gaussians(gaussians, usable, p, view.camera) for p in view.polygons]
-    covered = render(gaussians.take(np.any(guards, axis=0)), view.camera, passes=frozenset({"alpha"})).alpha
-    return view.polygon & (covered <= GUARD_FOOTPRINT)
-
-
-def _view_masks(before: ViewBefore, after: ViewAfter, hole: np.ndarray | None) -> ViewMasks:
-    depth, silhouette = before.depth, np.zeros(before.depth.shape, bool)
-    silhouette[after.window] = after.weight > CHANGED
-    target = np.zeros(depth.shape, bool) if hole is None else hole
+def _view_masks(before: ViewBefore, after: ViewAfter, needed: np.ndarray | None, consistent: bool) -> ViewMasks:
+    window, depth = after.window, before.depth
+    silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
+    silhouette[window] = after.weight > CHANGED
+    if consistent:  # else depths say nothing
+        occluder[window] = in_front(depth[window], after.weight > MOSTLY_OBJECT)
+    beside[window] = dilated(occluder[window], 2)
+    target = np.zeros(depth.shape, bool)
+    if needed is not None:  # beside what is in front T must not outgrow the object
+        target = needed & ~occluder & (silhouette | ~beside)
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     depth_after, alpha_after = before.depth.copy(), before.alpha.copy()
-    depth_after[after.window], alpha_after[after.window] = after.depth, after.alpha
-    return ViewMasks(before.camera, before.polygon, silhouette, target, depth, before.alpha, depth_after, alpha_after)
+    depth_after[window], alpha_after[window] = after.depth, after.alpha
+    shown = depth, before.alpha, depth_after, alpha_after
+    return ViewMasks(before.camera, before.polygon, silhouette, occluder, target, *shown)

@@ -181,7 +181,7 @@ def complete_view_depth(
     prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     depth_settings = replace(settings.depth, surface=surface)
-    known = rim(masks)
+    known = rim(masks) & ~masks.occluder
     return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, depth_settings)
 
 

@@ -84,7 +84,7 @@ def room(
         hidden, some = (cv2.dilate(object_, np.ones((n, n), np.uint8)) > 0 for n in (3, 7))
         depth = (z * (1 + noise * rng.normal(size=shape))).astype(np.float32)
         alpha, no = shown.astype(np.float32), np.zeros(shape, bool)
-        views.append(ViewMasks(camera, hidden, hidden, no, depth, alpha, depth, alpha))
+        views.append(ViewMasks(camera, hidden, hidden, no, no, depth, alpha, depth, alpha))
         witnesses.append(Witness(camera, photo, hidden, some & ~hidden, depth))
     return Room(views, witnesses)
 

@@ -61,7 +61,7 @@ def removal(extra: Gaussians | None = None) -> Removal:
     for camera in EYES:
         depth, alpha = surface_depth(whole, camera)
         no = np.zeros(depth.shape, bool)
-        views.append(ViewMasks(camera, no, no, no, depth, alpha, depth, alpha))
+        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha))
     selection = Selection(fates)
     masks = object_pixels(whole, selection.removed, views, ClearingSettings())
     witnesses = [
@@ -345,11 +345,13 @@ def test_what_is_known_only_from_below_the_mask_is_filled_too(charts: tuple[Char
 
 
 def test_what_stays_before_the_floor_is_not_filled(charts: tuple[Chart, ...], targets: Targets) -> None:
-    """A board within the block that other photos saw."""
+    """A board within the block that other photos saw, and pixels of a surface in front of the block."""
     given = removal(discs(np.array([[0, 0, 0.3]]), (0, 0, 1), np.full((1, 3), 0.5), 0.09))
-    found = chart_targets(
-        given.scene, given.selection, given.views, given.witnesses, charts, TOLERANCE, [NONE] * len(EYES)
-    )
+    views = list(given.views)
+    bar = np.zeros((120, 160), bool)
+    bar[:, 70:75] = True
+    views[3] = replace(views[3], occluder=bar)
+    found = chart_targets(given.scene, given.selection, views, given.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
     board = np.arange(len(given.scene)) == len(given.scene) - 1
     kept = given.scene.take(~given.selection.removed)
     lost = 0
@@ -358,6 +360,7 @@ def test_what_stays_before_the_floor_is_not_filled(charts: tuple[Chart, ...], ta
         assert solid.any() and not (view.target & solid).any()
         lost += int((plain_view.target & solid).sum())
     assert lost > 50
+    assert (targets.views[3].target & bar).any() and not (found.views[3].target & bar).any()
 
 
 def test_marked_pixels_are_filled_too(plain: Removal, charts: tuple[Chart, ...], targets: Targets) -> None:

@@ -17,6 +17,7 @@ def view() -> ViewMasks:
         CAMERA,
         silhouette,
         silhouette,
+        np.zeros(SHAPE, bool),
         silhouette,
         depth,
         np.ones(SHAPE, np.float32),

@@ -25,7 +25,7 @@ from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render, surface_depth
 from gimp3d.raster.backend import CpuBackend
 from gimp3d.raster.cpu_drawing import CpuDrawing
-from gimp3d.stages import look, selection
+from gimp3d.stages import look, selection, targets
 from gimp3d.stages import masks as stage
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
 from gimp3d.stages.selection import Fate, SelectionSettings
@@ -296,7 +296,7 @@ def test_every_view_is_drawn_a_fixed_number_of_times(monkeypatch: pytest.MonkeyP
 
         return run
 
-    for module, name in ((look, "drawing"), (stage, "render"), (selection, "label_weights")):
+    for module, name in ((look, "drawing"), (targets, "render"), (selection, "label_weights")):
         monkeypatch.setattr(module, name, counted(getattr(module, name)))
     per_view = []
     for count in (6, 12):
@@ -347,17 +347,17 @@ def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: flo
 @given(st.integers(0, 10**6), st.integers(1, 20), st.integers(1, 20))
 def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: int) -> None:
     rng = np.random.default_rng(seed)
-    bits = rng.random((3, height, width)) < 0.3
+    bits = rng.random((4, height, width)) < 0.3
     before = rng.random((2, height, width), np.float32)
     after = np.where(rng.random((2, height, width)) < 0.1, rng.random((2, height, width)), before).astype(np.float32)
     view = ViewMasks(cameras()[0], *bits, *before, *after)
-    for name, expected in zip(("polygon", "silhouette", "target"), bits):
+    for name, expected in zip(("polygon", "silhouette", "occluder", "target"), bits):
         found = getattr(view, name)
         assert found.dtype == bool and (found == expected).all()
     assert view.depth_after.dtype == view.alpha_after.dtype == np.float32
     assert (view.depth_after == after[0]).all() and (view.alpha_after == after[1]).all()
-    other = replace(view, target=~bits[2], depth_after=before[0])
-    assert (other.target == ~bits[2]).all() and (other.depth_after == before[0]).all()
+    other = replace(view, target=~bits[3], depth_after=before[0])
+    assert (other.target == ~bits[3]).all() and (other.depth_after == before[0]).all()
     assert other.depth_before is view.depth_before and other.alpha_before is view.alpha_before
     assert (view.depth_after == after[0]).all()
     with pytest.raises(FrozenInstanceError):

@@ -74,7 +74,7 @@ class _Round:
 
 def surface_depth_beside(view: ViewMasks, witness: Witness) -> np.ndarray:
     """[H, W] z of the solid surfaces that a view shows beside the object; 0 elsewhere."""
-    return np.where(witness.hidden | (view.alpha_before < SOLID), 0, view.depth_before)
+    return np.where(witness.hidden | (view.alpha_before < SOLID) | view.occluder, 0, view.depth_before)
 
 
 def surface_beside(
