@@ -76,7 +76,8 @@ def assert_filled(removal: Removal, true: Gaussians, views: Sequence[Camera] = (
     result = removal.after.gaussians
     for camera in views or cameras(4):
         error = render_bytes(result, camera).astype(float) - render_bytes(true, camera)
-        assert 10 * np.log10(255**2 / (error**2).mean()) > psnr, camera.id
+        found = 10 * np.log10(255**2 / (error**2).mean())
+        assert found > psnr, (camera.id, found)
 
 
 def assert_legal(removal: Removal) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SOLID, dilated, window_mask
-from ..raster import drawing, render_bytes, touched_window
+from ..raster import Window, drawing, render_bytes, touched_window
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Reference, Rule
 from ..view_state import ViewState
 
+OPAQUE = 0.99  # alpha of the emptied scene below which a gap shows through
 LAYER_STEP = 0.05  # relative z step that parts two surfaces
 MARGIN = 2  # px round T in which splats mix what is old and new
 DRAWN = 0.5  # blend weight of new Gaussians from which they cover a pixel
@@ -49,12 +50,29 @@ def after_reference(
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, reference), (int(coloured.sum()), reference), key=lambda found: found[0])
         told = rules if view.rules is None else np.where(coloured, rules, view.rules)
+        picture = redrawn(part.pasted(view.painted), filled, view.masks, touched)
         left = view.left
         if left.target.any():
             left = still_open(left, filled, added, rules, window_mask(touched, view.camera))
-        return replace(view, painted=part.pasted(view.painted), rules=told, best=best, left=left)
+        return replace(view, painted=picture, rules=told, best=best, left=left)
 
     return tuple(parallel_map(after, views))
+
+
+def redrawn(
+    picture: np.ndarray,  # [H, W, 3] uint8
+    filled: Gaussians,
+    view: ViewMasks,
+    touched: Window,  # where the last new Gaussians may be
+) -> np.ndarray:
+    """A painted view, with the filled scene where the removal left a gap that was never to be filled.
+
+    Beside what is in front, its soft edge is no target, but the emptied scene shows through it.
+    """
+    gap = view.silhouette & ~view.target & (view.alpha_after < OPAQUE) & window_mask(touched, view.camera)
+    if not gap.any():
+        return picture
+    return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
 
 
 def still_open(

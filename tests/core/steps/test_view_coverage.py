@@ -12,10 +12,10 @@ from scenes import discs as discs_on
 
 from gimp3d.gaussians import Gaussians
 from gimp3d.geometry import window_mask
-from gimp3d.raster import footprint, surface_depth, touched_window
+from gimp3d.raster import footprint, render_bytes, surface_depth, touched_window
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Rule
-from gimp3d.steps.coverage import MARGIN, still_open
+from gimp3d.steps.coverage import MARGIN, redrawn, still_open
 
 
 @cache
@@ -104,3 +104,29 @@ def test_nothing_new_leaves_the_hole_as_it_was() -> None:
     after = opened(far, told())
     hole = hole_of(view())
     assert after.target[hole].mean() > 0.95
+
+
+def test_gaps_that_were_no_target_are_drawn_from_the_filled_scene() -> None:
+    camera = view().camera
+    grey = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    gap = np.zeros((camera.height, camera.width), bool)
+    gap[40:45, 50:60] = True
+    one = replace(
+        view(),
+        silhouette=gap | view().silhouette,
+        target=view().target & ~gap,
+        alpha_after=np.where(gap | view().target, np.float32(0.5), np.float32(1.0)),
+    )
+    filled, everywhere, elsewhere = floor(with_hole=False), np.s_[:, :], np.s_[60:, :]
+    done = redrawn(grey, filled, one, everywhere)
+    np.testing.assert_array_equal(done[gap], render_bytes(filled, camera)[gap])
+    np.testing.assert_array_equal(done[~gap], grey[~gap])
+    assert (done[gap] != 128).any()
+    assert redrawn(grey, filled, one, elsewhere) is grey
+
+
+def test_views_without_gaps_are_not_drawn_anew() -> None:
+    camera = view().camera
+    solid = replace(view(), alpha_after=np.ones_like(view().alpha_after))
+    grey = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    assert redrawn(grey, floor(with_hole=False), solid, np.s_[:, :]) is grey
