@@ -17,7 +17,7 @@ from ..schema import Share
 from .charts import Chart, Hits, LaidPlane, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
-from .witness import Witness, total_over
+from .witness import AGREEING, Witness, total_over
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
 SOME_WEIGHT = 0.1  # blend weight of the removed Gaussians from which a photo may show some of the object
@@ -95,10 +95,10 @@ def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[LaidPlane])
 def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, charts: Sequence[Chart]) -> Selection:
     """The selection without the sunk rows [M] in whose place photos show a surface: no box cuts that out.
 
-    The charts are drawn as if these rows hid nothing, so one view alone would take the object for the surface.
+    The charts are drawn as if these rows hid nothing, so few photos would take the object for the surface.
     """
     fates = selection.fates.copy()
-    for chart in (c for c in charts if c.photos.max() > 1):
+    for chart in (c for c in charts if c.photos.max() >= AGREEING):
         index, *at, z = framed(chart.camera, scene.means[sunk].astype(np.float64))
         texels = tuple(at)
         shown = (chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below)[texels]
