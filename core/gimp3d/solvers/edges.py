@@ -47,6 +47,7 @@ class Edge:
     along: np.ndarray  # [2] unit
     ends: tuple[float, float]  # px along it, between which it is seen or runs through the hole
     step: np.ndarray  # [3] grey levels by which colours change across it, from left to right of `along`
+    mean: np.ndarray  # [3] grey levels, of what lies to its left and right
 
 
 def find_edges(
@@ -257,7 +258,7 @@ def _settled(
             ends.append(float(t[_length(sums, _step(near))]))
         told = float(_told(sides, 2 * LEAST)[0])
         means = [[s[0, 1:4] / max(s[0, 0], 1) for s in pair] for pair in sides]
-        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)))
+        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), np.mean(means, (0, 1)))
         if not steady or side == BOTH:
             return told, edge if steady else None
         way = (cut.min(), cut.max()) if side == BEFORE else (cut.max(), cut.min())
@@ -321,13 +322,13 @@ def guide_of(
     shrunk: float,  # times, the picture that the edges were found in
     width: float,  # px, σ
 ) -> np.ndarray:
-    """[h, w, 5] float32 in [-1, 1]: how near to an edge a pixel lies, on which side of it, and the edge's step.
+    """[h, w, 8] float32 in [-1, 1]: how near to an edge a pixel lies, on which side, the edge's step and mean colour.
 
     Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one, and past its ends.
     """
     h, w = shape
     x, y = (np.arange(n, dtype=np.float32) for n in (w, h))
-    guide, nearest = np.zeros((h, w, 5), np.float32), np.full((h, w), np.inf, np.float32)
+    guide, nearest = np.zeros((h, w, 8), np.float32), np.full((h, w), np.inf, np.float32)
     for edge in edges:
         origin = (edge.origin + 0.5) / shrunk - 0.5
         dx, dy = x[None] - np.float32(origin[0]), y[:, None] - np.float32(origin[1])
@@ -336,7 +337,7 @@ def guide_of(
         there = (along >= edge.ends[0] / shrunk) & (along <= edge.ends[1] / shrunk)
         closer = there & (np.abs(off) < nearest)
         fades = np.exp(-0.5 * off**2)
-        step = fades[..., None] * np.float32(edge.step / 255)
-        guide[closer] = np.dstack([fades, off * fades * np.float32(math.exp(0.5)), step])[closer]
+        colours = fades[..., None] * np.float32(np.concatenate([edge.step, edge.mean - 128]) / 255)
+        guide[closer] = np.dstack([fades, off * fades * np.float32(math.exp(0.5)), colours])[closer]
         nearest[closer] = np.abs(off)[closer]
     return guide

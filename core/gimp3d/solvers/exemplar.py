@@ -39,7 +39,7 @@ SCREENING = 0.01  # weight of the voted colours beside their gradients
 SELECTIVE = 4.0  # a patch that only a quarter fits worse than votes by e^-4: higher is sharper, and noisier
 LEAST_SAY = 1e-12  # of a patch that fits badly
 EDGE = 0.15  # difference in colour that counts as much as being on an edge, or beside it, or not
-GUIDE = np.array([EDGE, EDGE, 1, 1, 1], np.float32)  # what differences of guide_of count: the edge's step as colours do
+GUIDE = np.array([EDGE, EDGE, *[1] * 6], np.float32)  # what differences of guide_of count: an edge's colours as others
 FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
 
 
@@ -143,7 +143,7 @@ class _Level:
 
     channels: np.ndarray  # [h, w, 5] float32: colours and texture features
     hole: np.ndarray  # [h, w] bool
-    edges: np.ndarray  # [h, w, 5] float32, see guide_of: known in the hole as well
+    edges: np.ndarray  # [h, w, 8] float32, see guide_of: known in the hole as well
     touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy

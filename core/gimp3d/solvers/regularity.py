@@ -17,7 +17,7 @@ from ..geometry import colours_at
 
 SIDE = 96  # px: pictures are shrunk to this to find motions in
 ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms
-EXPLAINED = 0.97  # share of the surroundings' variance that a motion must explain
+EXPLAINED = 0.97  # share of the variance that a motion must explain, of the surroundings and right beside the hole
 OVERLAP = 0.75  # share of the surroundings that it must map to something known
 TOLD = 0.2  # share of the hole that it must tell
 CANDIDATES = 3  # translations that are looked at for every angle
@@ -25,7 +25,7 @@ TRIED = 16  # motions that are followed up
 BAND = 0.75  # width of the surroundings, in thicknesses of the hole
 LEAST_BAND = 6  # px
 PLAIN = 3 * 255.0**-2  # variance of the surroundings, one grey level in each channel, below which nothing is regular
-RIM, CONTRADICTED = 4, 0.01  # px beside the hole, and the share of them that may be quite unlike what they map to
+RIM = 4  # px right beside the hole
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _band(hole: np.ndarray, known: np.ndarray) -> np.ndarray:
     return known & (far <= max(LEAST_BAND, 2 * BAND * thickness))
 
 
-def _variance(image: np.ndarray, where: np.ndarray) -> float:
+def _variance(image: np.ndarray, where: np.ndarray | tuple[np.ndarray, np.ndarray]) -> float:
     return float(image[where].var(0).sum())
 
 
@@ -166,9 +166,9 @@ def _settled(
     shift: np.ndarray,
 ) -> Motion | None:
     """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; it turns about the hole."""
-    ring, inside = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000)))
-    rim = np.nonzero(known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0))
-    shows, total = known.astype(np.float32), 2 * _variance(image, band)
+    beside = known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0)
+    ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (beside, 4000)))
+    shows = known.astype(np.float32)
     middle = np.argwhere(hole).mean(0)
     target = _turn(angle, mirrored) @ middle + shift
 
@@ -176,15 +176,15 @@ def _settled(
         turn = _turn(angle + values[0], mirrored)
         return turn, target + values[1:] - turn @ middle
 
-    def unexplained(values: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Of the pixels that are mapped to something known, over the variance of the surroundings."""
+    def explained(values: np.ndarray, of: tuple[np.ndarray, np.ndarray] = ring, overlap: float = OVERLAP) -> float:
+        """Share of the variance of the pixels; so many of them must be mapped to something known."""
+        rows, cols = of
         y, x = _mapped(*at(values), rows, cols)
         both = _sample(shows, y, x) > 0.999
-        return ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1) / total
-
-    def explained(values: np.ndarray) -> float:
-        rest = unexplained(values, *ring)
-        return 1 - float(rest.mean()) if len(rest) >= max(1, OVERLAP * len(ring[0])) else -np.inf
+        if both.sum() < max(1, overlap * len(rows)):
+            return -np.inf
+        rest = ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1).mean()
+        return 1 - float(rest) / (2 * max(_variance(image, of), PLAIN))
 
     values, step = np.zeros(3), 1.0
     best = explained(values)
@@ -199,11 +199,10 @@ def _settled(
             step /= 2
     y, x = _mapped(*at(values), *inside)
     tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
-    # where something ends at the hole, only its rim contradicts
-    contradicted = unexplained(values, *rim) > 0.5
-    if not tells or best < EXPLAINED or contradicted.sum() > CONTRADICTED * len(contradicted):
+    # where something ends at the hole, only its rim contradicts; where it is plain, something far off is explained
+    if not tells or min(best, explained(values, rim, 0)) < EXPLAINED:
         return None
-    return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * total / 3))
+    return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * _variance(image, ring) / 3))
 
 
 def _thinned(where: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -80,7 +80,7 @@ def _look_at(
     textures = Textures.make(witnesses)
     surface = lay_surface(camera, away, plane, region, views, witnesses, textures, enough=ENOUGH)
     said = ask(witnesses, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
-    image, spread = mosaic(surface.points, plane.normal, witnesses, said)
+    image, spread, _ = mosaic(surface.points, plane.normal, witnesses, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
     there = np.ones(photos.shape, bool)
     for other in planes:

@@ -21,11 +21,12 @@ def mosaic(
     normal: np.ndarray,  # [3] unit
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
 
     And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: light
-    differs between photos on any surface, but things that do not lie on it also show another texture in each.
+    differs between photos on any surface, but things that do not lie on it also show another texture in each. And how
+    loud the texture is that most of them show, likewise: a loud one differs more where photos are a little misplaced.
 
     Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
     decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time, brought
@@ -51,10 +52,10 @@ def mosaic(
 
     parts = parallel_map(of, range(len(witnesses)))
     samples, textures, density = (np.array([p[k] for p in parts]) for k in range(3))
-    middle, spread = np.zeros((h * w, 3), np.float32), np.zeros(h * w, np.float32)
-    run_ranges(_agree_range, h * w, samples, textures, density, middle, spread)
+    middle, (spread, loud) = np.zeros((h * w, 3), np.float32), np.zeros((2, h * w), np.float32)
+    run_ranges(_agree_range, h * w, samples, textures, density, middle, spread, loud)
     several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
-    spread = _smooth(spread.reshape(h, w, 1), several)
+    spread, loud = (_smooth(a.reshape(h, w, 1), several)[..., 0] for a in (spread, loud))
 
     def correction(k: int) -> np.ndarray:
         off = _smooth((middle - samples[k]).reshape(h, w, 3), told[k])
@@ -63,7 +64,7 @@ def mosaic(
     corrections = np.array(parallel_map(correction, range(len(witnesses))))
     picture = middle.copy()
     run_ranges(_choose_range, h * w, samples, corrections, density, middle, FEW, FEW + LOUD * spread.ravel(), picture)
-    return np.clip(np.rint(picture), 0, 255).reshape(h, w, 3).astype(np.uint8), spread[..., 0]
+    return np.clip(np.rint(picture), 0, 255).reshape(h, w, 3).astype(np.uint8), spread, loud
 
 
 def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -73,7 +74,7 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 @exact_kernel
-def _agree_range(lo, hi, samples, textures, density, middle, spread):
+def _agree_range(lo, hi, samples, textures, density, middle, spread, loud):
     values = np.empty(len(samples))
     for i in range(lo, hi):
         count = 0
@@ -94,6 +95,7 @@ def _agree_range(lo, hi, samples, textures, density, middle, spread):
                 values[count] = textures[k, i]
                 count += 1
         part = np.sort(values[:count])
+        loud[i] = 0.5 * abs(part[count // 2])
         spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
 
 

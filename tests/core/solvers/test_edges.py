@@ -113,17 +113,20 @@ def test_pixels_of_one_guide_lie_at_one_distance() -> None:
 
 
 def test_edges_of_two_kinds_have_two_guides() -> None:
-    """Beside a dark stripe nothing is copied from beside a bright one, nor from its other edge."""
+    """Beside a dark stripe nothing is copied from beside a bright one, nor from its other edge, nor from where the
+    step is the same, as from the bright stripe's far side."""
     off = side_of(48, 0)
     picture = textured(np.select([np.abs(off + 15) < 8, np.abs(off - 15) < 8], [70.0, 190.0], 130.0), 5)
     edges = sorted(found(picture), key=lambda e: e.origin[1] * e.along[0] - e.origin[0] * e.along[1])
     into, out_of, onto, off_it = (e.step.mean() for e in edges)
     assert min(out_of, onto) > 40 and max(into, off_it) < -40
-    # where the distance from each is the same, the guide tells them apart by as much as their steps
+    # where the distance from each is the same, the guide tells them apart by their steps and by their colours
     places = [tuple(np.rint(e.origin).astype(int)[::-1]) for e in edges]
     guides = np.array([guide_of(edges, HOLE.shape, 1, 6)[place] for place in places])
     assert np.ptp(guides[:, :2], axis=0).max() < 0.3
-    assert np.allclose(255 * guides[:, 2:], [e.step for e in edges], atol=12)
+    assert np.allclose(255 * guides[:, 2:5], [e.step for e in edges], atol=12)
+    assert np.allclose(128 + 255 * guides[:, 5:], [e.mean for e in edges], atol=12)
+    assert np.allclose([e.mean.mean() for e in edges], [100, 100, 160, 160], atol=12)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -67,6 +67,15 @@ def test_noise_and_plain_pictures_are_not_regular(strength: int) -> None:
     assert find_motions(picture, hole, ~hole) == ()
 
 
+def test_a_stripe_does_not_make_the_wall_beside_it_regular() -> None:
+    """A wall that darkens to one side, and a white stripe far from the hole: the stripe is nearly all that varies."""
+    rows, cols = np.mgrid[:90, :120]
+    wall = 150 - 0.12 * rows[..., None] + np.random.default_rng(0).normal(0, 1, (90, 120, 3))
+    picture = np.where((np.abs(cols - 95) < 4)[..., None], 230, wall).astype(np.uint8)
+    hole = (np.abs(rows - 40) < 16) & (np.abs(cols - 60) < 20)
+    assert find_motions(picture, hole, ~hole) == ()
+
+
 def test_a_hole_without_surroundings_has_no_motions() -> None:
     hole = np.ones((40, 50), bool)
     picture = np.zeros((40, 50, 3), np.uint8)

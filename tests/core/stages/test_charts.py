@@ -309,6 +309,27 @@ def test_what_photos_disagree_on_below_the_mask_stays_hole(
     assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
 
 
+def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
+    floor_room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a pixel: they differ by more than on plain floor, but by less than they have in common."""
+
+    def half_plain(points: np.ndarray) -> np.ndarray:
+        x = points[..., :1]
+        return np.repeat(120 + 100 * np.cos(2 * np.pi * x / 0.13) * (x > 0.35), 3, -1)
+
+    loud = room(EYES, [FLOOR], colours=half_plain)
+    beside = [replace(w, photo=np.roll(w.photo, k % 3 - 1, 1)) for k, w in enumerate(loud.witnesses)]
+    plane = Plane.make(np.zeros(3), UP, REGION)
+    known = []
+    for share in (draw.MISPLACED, 0):
+        monkeypatch.setattr(draw, "MISPLACED", share)
+        (chart,) = charts_of([plane], loud.views, beside)
+        stripes = (texels(chart)[:, 0] > 0.4).reshape(chart.hole.shape) & chart.there & ~chart.hole & (chart.photos > 1)
+        known.append(chart.known[stripes].mean())
+    assert known[0] > 0.9 and known[1] < 0.5
+
+
 def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
     floor_room: Room, wide: list[Witness], wide_chart: Chart
 ) -> None:
@@ -498,7 +519,7 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     known[disputed] = False
     colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
     image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
-    shown = draw._Shown(~no, image, photos, np.uint16(5) - photos, known, hole, ~no)
+    shown = draw._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no)
     _, rests = draw._told_by_colours(shown, image[hole], no, no)
     assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
     assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed

@@ -60,7 +60,7 @@ def photos() -> list[Witness]:
 
 
 def test_the_floor_shows_as_it_is(photos: list[Witness]) -> None:
-    picture, spread = mosaic(POINTS, UP, photos, said_of(photos))
+    picture, spread, _ = mosaic(POINTS, UP, photos, said_of(photos))
     assert picture.dtype == np.uint8 and spread.dtype == np.float32
     assert np.abs(picture - texture(POINTS)).max() < 2.5
     assert spread.max() < 2.5
@@ -70,7 +70,7 @@ def test_one_photo_of_other_colours_does_not_show(photos: list[Witness]) -> None
     """Though it is the one that shows the floor best."""
     best = int(np.argmax([w.camera.centre[2] for w in photos]))
     wrong = [replace(w, photo=255 - w.photo) if k == best else w for k, w in enumerate(photos)]
-    picture, spread = mosaic(POINTS, UP, wrong, said_of(wrong))
+    picture, spread, _ = mosaic(POINTS, UP, wrong, said_of(wrong))
     assert np.abs(picture - texture(POINTS)).max() < 4
     assert spread.max() < 4
 
@@ -81,7 +81,7 @@ def test_what_no_photo_shows_is_black_and_what_one_shows_is_not(photos: list[Wit
     hidden = [hiding(w, never | most if k else never) for k, w in enumerate(photos)]
     said = said_of(hidden)
     shown = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
-    picture, _ = mosaic(POINTS, UP, hidden, said)
+    picture, _, _ = mosaic(POINTS, UP, hidden, said)
     assert not shown[never].any() and shown[most][30:].any()
     assert not picture[~shown].any()
     clear = (said == Says.SEEN).any(0)
@@ -94,7 +94,7 @@ def test_what_is_beside_the_object_counts_only_where_nothing_else_is_seen(photos
     said[1:, :, 50:] = Says.BESIDE
     said[0, :, 75:] = Says.HIDDEN
     flat = [replace(w, photo=np.full_like(w.photo, c)) for w, c in zip(photos, (100, 140, 148))]
-    picture, spread = mosaic(POINTS, UP, flat, said)
+    picture, spread, _ = mosaic(POINTS, UP, flat, said)
     far = np.s_[:, 0:30], np.s_[:, 60:65], np.s_[:, 95:]  # from where another median is mixed in
     assert [int(np.median(picture[f])) for f in far] == [140, 100, 144]
     assert not spread.any()  # of another light, but of the same texture: none
@@ -109,7 +109,7 @@ def test_plain_photos_make_their_median_and_differ_in_light_only(values: list[in
         colours = np.full((180, 240, 3), 77, np.uint8)
         colours[..., channel] = value
         plain.append(replace(photo(camera), photo=colours))
-    picture, spread = mosaic(POINTS, UP, plain, np.full((len(plain), 80, 100), Says.SEEN, np.uint8))
+    picture, spread, _ = mosaic(POINTS, UP, plain, np.full((len(plain), 80, 100), Says.SEEN, np.uint8))
     expected = np.full(3, 77.0)
     expected[channel] = np.median(values)
     assert np.abs(picture - expected).max() <= 0.5 + 1e-3
@@ -131,9 +131,11 @@ def test_photos_differ_where_they_show_textures_of_their_own(photos: list[Witnes
         own = np.clip(120 + noise, 0, 255)[..., None].repeat(3, 2)
         other.append(replace(w, photo=np.where(mask, own, w.photo).astype(np.uint8)))
     told = said_of(brighter)
-    (_, light), (_, texture_) = (mosaic(POINTS, UP, p, told) for p in (brighter, other))
+    (_, light, loud), (_, texture_, common) = (mosaic(POINTS, UP, p, told) for p in (brighter, other))
     assert light[inner].max() < 4 and light[~edge].max() < 2.5
     assert texture_[inner].min() > 10 and texture_[~edge].max() < 2.5
+    # they have more in common than apart where they show one texture, and less where they show several
+    assert loud[inner].mean() > 4 * light[inner].mean() and common[inner].mean() < texture_[inner].mean()
 
 
 def test_detail_is_that_of_the_photo_with_most_pixels() -> None:
@@ -144,9 +146,9 @@ def test_detail_is_that_of_the_photo_with_most_pixels() -> None:
     no, z = np.zeros((160, 200), bool), np.full((160, 200), 4, np.float32)
     far = [Witness(ABOVE, np.full((80, 100, 3), 104, np.uint8), no[:80, :100], no[:80, :100], z[:80, :100])] * 3
     witnesses = [*far[:2], Witness(near, sharp, no, no, z), far[2]]
-    picture, _ = mosaic(POINTS, UP, witnesses, said_of(witnesses))
+    picture, _, _ = mosaic(POINTS, UP, witnesses, said_of(witnesses))
     truth = sharp.reshape(80, 2, 100, 2, 3)[:, 0, :, 0]
     assert np.abs(picture.astype(int) - truth)[:, 10:-10].max() <= 1
     loud = replace(witnesses[2], photo=(sharp.astype(int) + 30).astype(np.uint8))
-    picture, _ = mosaic(POINTS, UP, [*far[:2], loud, far[2]], said_of(witnesses))
+    picture, _, _ = mosaic(POINTS, UP, [*far[:2], loud, far[2]], said_of(witnesses))
     assert (picture == 104).all()

@@ -25,6 +25,7 @@ from .surface import TELLING, Laid, facing_camera, lay_surface, pixel_size
 
 VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
+MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
 SOFT = 8  # texels round a hole that may show some of the object
@@ -113,6 +114,7 @@ class _Shown:
     photos: np.ndarray  # uint16, how many show it
     hiding: np.ndarray  # uint16, in how many the object's mask covers it
     known: np.ndarray  # bool
+    alike: np.ndarray  # bool, known without allowing for misplaced texture
     hole: np.ndarray  # bool
     alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
 
@@ -180,17 +182,18 @@ def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], toler
     said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
     there = shown_there(said)
     hole = _unseen(said) & there
-    image, spread = mosaic(points, plane.normal, witnesses, said)
+    image, spread, loud = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
     limit = usual_spread(spread[there & (photos > 1) & ~hole])
     alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & (hiding > photos)
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
-    below, spread_below = mosaic(points, plane.normal, witnesses, beneath)
-    known = alike & there & (photos > 1) & ~hole
+    below, spread_below, _ = mosaic(points, plane.normal, witnesses, beneath)
+    several = there & (photos > 1) & ~hole
+    known = several & (spread <= limit + MISPLACED * loud)
     image = np.where(hole[..., None], below, image)
-    return _Shown(there, image, photos, hiding, known, hole, spread_below <= limit)
+    return _Shown(there, image, photos, hiding, known, several & alike, hole, spread_below <= limit)
 
 
 def _told_by_colours(
@@ -207,11 +210,11 @@ def _told_by_colours(
     s = shown
     far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
     doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
-    around = s.known & ~doubtful & (far < math.sqrt(s.hole.sum()))
+    around = s.alike & ~doubtful & (far < math.sqrt(s.hole.sum()))
     object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
     below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
     below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
-    rests = object_ & s.known  # photos would not agree on something else that stands there
+    rests = object_ & s.alike  # photos would not agree on something else that stands there
     spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
     return below, (rests | dilated(spots, MIXED)) & (s.photos > 0)
 
