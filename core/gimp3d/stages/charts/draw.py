@@ -14,7 +14,7 @@ from ...box import Region, in_region
 from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
-from ..footprint import shows_object
+from ..footprint import GRAIN, shows_object
 from ..masks import ViewMasks
 from ..mosaic import mosaic
 from ..witness import Says, Textures, Witness, ask
@@ -28,6 +28,7 @@ UNLIKE = 3.0  # times what photos of the surface differ by, from which they show
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
+UNUSUAL = 99  # percent of surface texels that are less unlike those near them than what is none
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
@@ -216,7 +217,41 @@ def _told_by_colours(
     below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
     rests = object_ & s.alike  # photos would not agree on something else that stands there
     spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
-    return below, (rests | dilated(spots, MIXED)) & (s.photos > 0)
+    rests = (rests | dilated(spots, MIXED)) & (s.photos > 0)
+    hole = (s.hole & ~below) | rests
+    return below, rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0))
+
+
+def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """[H, W] bool: texels beside the object, hidden in most photos, unlike all of the surface near by.
+
+    More so than what of the surface is near them: a texel is compared with those that are not right beside it.
+    """
+    beside &= shown.hiding > shown.photos
+    known = shown.alike & ~hole & ~beside
+    away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 5)
+    usual = _unlike_near(shown.image, known & (away <= SOFT), known)
+    found = np.zeros_like(beside)
+    if len(usual):
+        found[beside] = _unlike_near(shown.image, beside, known) > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
+    return found
+
+
+def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[N] RMS grey levels by which texels [H, W] bool differ from the most similar ones near by that are known.
+
+    0 where none is. Those within MIXED are not asked.
+    """
+    rows, cols = np.nonzero(texels)
+    least = np.full(len(rows), np.inf, np.float32)
+    for down, right in np.ndindex(2 * SOFT + 1, 2 * SOFT + 1):
+        if max(abs(down - SOFT), abs(right - SOFT)) > MIXED:
+            y, x = rows + down - SOFT, cols + right - SOFT
+            there = (y >= 0) & (x >= 0) & (y < len(known)) & (x < known.shape[1])
+            there[there] = known[y[there], x[there]]
+            off = image[y[there], x[there]].astype(np.float32) - image[rows[there], cols[there]]
+            least[there] = np.minimum(least[there], (off**2).mean(-1))
+    return np.sqrt(np.where(np.isfinite(least), least, 0))
 
 
 def _without_islands(
