@@ -328,12 +328,14 @@ def _shift(look: _Look, thin: tuple[slice, slice], points: np.ndarray, surface: 
 
 
 def _height_doubt(chart: Chart) -> np.ndarray:
-    """[H, W] standard deviation of a relief's height where no photo shows it, scene units; 0 on planes."""
-    if chart.kind == "plane" or not chart.known.any():
-        return np.zeros(chart.depth.shape, np.float32)
-    away = cv2.distanceTransform((~chart.known).astype(np.uint8), cv2.DIST_L2, 5)
-    lags = variogram(chart.depth[..., None], chart.known, float(away[chart.hole].max(initial=0)))
-    return np.sqrt(at_lag(lags, away)).astype(np.float32)
+    """[H, W] standard deviation of the surface's height, scene units: as drawn depths scatter, and where no photo
+    shows a relief it may be higher or lower besides."""
+    variance = np.full(chart.depth.shape, chart.noise**2)
+    if chart.kind != "plane" and chart.known.any():
+        away = cv2.distanceTransform((~chart.known).astype(np.uint8), cv2.DIST_L2, 5)
+        lags = variogram(chart.depth[..., None], chart.known, float(away[chart.hole].max(initial=0)))
+        variance += at_lag(lags, away)
+    return np.sqrt(variance).astype(np.float32)
 
 
 def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence[Witness]) -> np.ndarray:

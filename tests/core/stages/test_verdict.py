@@ -191,6 +191,10 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
     assert told.invented < 0.3 * good.invented and told.score > good.score
     other = replace(picture, image=cv2.bitwise_not(picture.image))
     assert plain.judged(patch, given=other).score < told.score
+    # other views see it beside its place if surfaces are drawn at other heights than the chart's
+    rough = replace(plain, charts=tuple(replace(c, noise=0.2 * BLOCK) for c in plain.charts))
+    assert rough.judged(patch, given=picture).score < told.score - 0.02
+    assert rough.judged(patch).score == pytest.approx(good.score, abs=0.01)
 
 
 def test_nothing_to_judge(plain: Case, patch: Gaussians) -> None:
