@@ -553,3 +553,16 @@ def test_mixed_pixels_beside_the_object_are_unlike_all_of_the_surface_near_by(gr
     assert found[dashes].all() and not found[spot].any() if grain == 1 else found[dashes].mean() < 0.2
     assert (found & ~dashes & ~spot).sum() <= 0.03 * beside.sum()
     assert not mixed(5, 2).any()  # most photos show it
+
+
+def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:
+    """Rough depths let photos see through the surface at a spot; a table's edge, in half of what is round the hole."""
+    said = np.full((5, 60, 80), Says.SEEN, np.uint8)
+    said[:, 20:40, 30:50] = Says.HIDDEN
+    edge = said.copy()
+    said[:, 27:30, 26:30] = Says.THROUGH
+    there = draw.shown_there(said)
+    assert there[20:40, 32:50].all() and not there[28, 28]
+    edge[:, :, 40:][edge[:, :, 40:] == Says.SEEN] = Says.THROUGH
+    there = draw.shown_there(edge)
+    assert there[20:40, 30:37].all() and not there[20:40, 44:].any()

@@ -14,6 +14,7 @@ from ...box import Region, in_region
 from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
+from ...solvers.variogram import carried
 from ..footprint import GRAIN, shows_object
 from ..masks import ViewMasks
 from ..mosaic import mosaic
@@ -225,22 +226,27 @@ def _told_by_colours(
 def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
     """[H, W] bool: texels beside the object, hidden in most photos, unlike all of the surface near by.
 
-    More so than what of the surface is near them: a texel is compared with those that are not right beside it.
+    More so than what of the surface is near them: a texel is compared with those that are not right beside it. And
+    more like what photos show in the hole.
     """
     beside &= shown.hiding > shown.photos
     known = shown.alike & ~hole & ~beside
     away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 5)
-    usual = _unlike_near(shown.image, known & (away <= SOFT), known)
+    around = known & (away <= SOFT)
+    if not around.any():
+        return around
+    foreign, usual = (_unlike_near(shown.image, texels, known) for texels in (beside, around))
+    unlike_object, usually = (_unlike_near(shown.image, texels, hole) for texels in (beside, around))
     found = np.zeros_like(beside)
-    if len(usual):
-        found[beside] = _unlike_near(shown.image, beside, known) > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
+    found[beside] = foreign > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
+    found[beside] &= unlike_object < np.median(usually)
     return found
 
 
 def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np.ndarray:
     """[N] RMS grey levels by which texels [H, W] bool differ from the most similar ones near by that are known.
 
-    0 where none is. Those within MIXED are not asked.
+    Not at all where none is. Those within MIXED are not asked.
     """
     rows, cols = np.nonzero(texels)
     least = np.full(len(rows), np.inf, np.float32)
@@ -325,7 +331,7 @@ def _unseen(said: np.ndarray) -> np.ndarray:
 
 
 def shown_there(said: np.ndarray) -> np.ndarray:
-    """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so nearest."""
+    """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so round it."""
     seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
     through = (said == Says.THROUGH).sum(0)
     known = seen + through > 0
@@ -333,5 +339,4 @@ def shown_there(said: np.ndarray) -> np.ndarray:
         return np.ones(known.shape, bool)
     # single texels beside the object's foot err; edges of tables are long
     votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
-    rows, cols = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return (np.where(known, votes, 0) >= 0)[rows, cols]
+    return carried(votes[..., None].repeat(3, -1), known)[..., 0] >= 0
