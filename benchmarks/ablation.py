@@ -75,6 +75,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
     ),
     "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
+    "textures may not be misplaced": (("gimp3d.stages.charts.draw:MISPLACED", 0.0),),
+    "mixed pixels at the outline stay": (
+        ("gimp3d.stages.charts.draw:_mixed", lambda _, hole, __: np.zeros_like(hole)),
+    ),
     "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
     # what stays round it
     "what stays learns nothing": (("gimp3d.steps.relearning:SHOWN", math.inf),),
@@ -100,7 +104,8 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
     "no edge turns a corner, nor ends unseen": (("gimp3d.solvers.edges:_joined", lambda *_: []),),
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
-    "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, 0, 0, 0])),),
+    "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[0] * 6])),),
+    "edges of one step are": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[1] * 3, *[0] * 3])),),
     "averages of patches stay": (("gimp3d.solvers.exemplar:COPIED", 0.0), ("gimp3d.solvers.exemplar:MOSAICS", 0)),
     "what is copied is not matched again": (("gimp3d.solvers.exemplar:MOSAICS", 0),),
     "votes have no say in the mosaic": (("gimp3d.solvers.exemplar:COPIED", 1.0),),

@@ -229,7 +229,7 @@ def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
     More so than what of the surface is near them: a texel is compared with those that are not right beside it. And
     more like what photos show in the hole.
     """
-    beside &= shown.hiding > shown.photos
+    beside = beside & (shown.hiding > shown.photos)
     known = shown.alike & ~hole & ~beside
     away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 5)
     around = known & (away <= SOFT)
