@@ -16,7 +16,7 @@ from ...compute.threads import parallel_map
 from ...geometry import SOLID, surface_points
 from ...schema import AtLeastOne, Share
 from ..masks import ViewMasks
-from ..witness import Says, Textures, Witness, ask
+from ..witness import AGREEING, Says, Textures, Witness, ask
 from .plane import Plane, extent, largest_plane
 
 TOLERANCE = 0.05  # relative z by which a view's surface must be nearer to hide a point: rough scans scatter by 3 to 9 %
@@ -104,7 +104,8 @@ def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], reg
     said = ask(witnesses, points, TOLERANCE)
     share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
     near = share > HIDDEN
-    if not near.any():  # one view, or all from one place: what is beside the object is all that tells
+    # few views, or all from one place: what is beside the object is all that tells
+    if len(views) < AGREEING or not near.any():
         near, share = np.ones(len(points), bool), np.ones(len(points))
     return _Round(points[near], eyes[near], share[near] ** 2)
 
