@@ -230,6 +230,4 @@ def test_two_views_from_one_side_find_the_table(shared_data: Path) -> None:
     views = perturbed_views(desk, reference, "views", 2)
     given = removal(desk, PRESETS["draft"], reference, desk.truth(reference), views)
     found = mean_psnrs(desk, filled(desk.gaussians, given), desk.test[1:])
-    assert (
-        found["mask"] > 26 and found["unseen"] > 24
-    )  # measured: 28.7 and 26.7; on a plane that is not there 15 and 11
+    assert found["mask"] > 26 and found["unseen"] > 24  # measured: 28.7, 26.7; on a plane that is not there 15, 11
