@@ -122,6 +122,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "sky only as far as photos ask": (("gimp3d.stages.shadow:DULL", 0.0),),
     "depth alone tells what is ground": (("gimp3d.stages.lifting:_shows", _by_depth_alone),),
     "pixels beside the object are lifted": (("gimp3d.stages.lifting:MIXED", 0.3),),
+    "lifted ground may be brighter than lit ground": (("gimp3d.stages.lifting:BRIGHTER", math.inf),),
     "the darkest are lifted": (("gimp3d.stages.lifting:DARKEST", 0.05),),
     "the support is what photos agree on best": (("gimp3d.steps.light:support_first", lambda planes, _: planes),),
     "walls hide no sky": (

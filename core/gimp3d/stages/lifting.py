@@ -25,6 +25,9 @@ from .witness import Witness
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
+BRIGHTER = (
+    8.0  # grey levels by which lifted ground may be brighter than lit ground is: else less light is missing there
+)
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
@@ -42,7 +45,7 @@ class Lifted:
     photos: tuple[np.ndarray, ...]  # [H, W, 3] uint8, … and how they are lifted
     light: tuple[np.ndarray, ...]  # [H, W] uint8, of 255: the share of light that arrives in them
     shaded: tuple[np.ndarray, ...]  # [H, W] bool, what changed in them
-    dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted
+    dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted, or would be too bright: it is filled
     rows: np.ndarray  # [M] of the scene whose colours changed
     sh: np.ndarray  # [M, K, 3] their new ones
     confidence: float
@@ -91,6 +94,8 @@ class Arriving:
 
     window: Window
     light: np.ndarray  # [h, w, 3] float32, the share of light that arrives at what is shown
+    ground: np.ndarray  # [h, w] bool, where that is ground
+    brightest: float  # grey level of ground that is not in the shadow
 
 
 def _grey(light: np.ndarray) -> np.ndarray:
@@ -99,7 +104,7 @@ def _grey(light: np.ndarray) -> np.ndarray:
 
 
 def _lifted(witness: Witness, arriving: Arriving) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A photo without the shadow, what changed in it, what is too dark for that, and the light of 255."""
+    """A photo without the shadow, what changed in it, what cannot be lifted, and the light of 255."""
     photo, light = witness.photo.copy(), np.full(witness.hidden.shape, 255, np.uint8)
     shaded, dark = np.zeros((2, *light.shape), bool)
     part, window = witness.cropped(arriving.window), arriving.window
@@ -110,6 +115,10 @@ def _lifted(witness: Witness, arriving: Arriving) -> tuple[np.ndarray, np.ndarra
     inside = shaded[window]
     bright = encoded(linear(part.photo[inside]) / np.maximum(arriving.light[inside], DARKEST))
     photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
+    too_bright = np.zeros(inside.shape, np.uint8)
+    too_bright[inside] = 255 * bright.max(-1) > arriving.brightest + BRIGHTER
+    too_bright &= arriving.ground
+    dark[window] |= cv2.morphologyEx(too_bright, cv2.MORPH_OPEN, np.ones((3, 3))) > 0  # single pixels are grain
     return photo, shaded, dark, light
 
 
@@ -143,7 +152,7 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
     few = out[grid]
     if few.min() > UNTOUCHED:
-        return Arriving(window, np.ones_like(out))
+        return Arriving(window, np.ones_like(out), on >= 0, 255.0)
     kernel = np.ones((3, 3), np.uint8)
     dim = _grey(few)
     uneven = cv2.dilate(dim, kernel) - cv2.erode(dim, kernel) > EVEN
@@ -156,7 +165,9 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     x, y = np.meshgrid(x, y)
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
-    return Arriving(window, out)
+    lit = (on >= 0) & ~witness.hidden & (_grey(out) >= UNTOUCHED)
+    brightest = float(np.percentile(witness.photo[lit].max(-1), 99.9)) if lit.any() else 255.0
+    return Arriving(window, out, on >= 0, brightest)
 
 
 def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarray:

@@ -64,10 +64,31 @@ def test_dim_pixels_right_beside_the_object_are_filled_and_not_lifted() -> None:
     window = slice(0, 30), slice(0, 40)
     near = cv2.dilate((hidden | beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for light, filled in ((0.9, near & False), (0.6, near & ~hidden), (0.2, ~hidden)):
-        photo, shaded, dark, _ = _lifted(witness, Arriving(window, np.full((30, 40, 3), light, np.float32)))
+        arriving = Arriving(window, np.full((30, 40, 3), light, np.float32), ~hidden, 255.0)
+        photo, shaded, dark, _ = _lifted(witness, arriving)
         np.testing.assert_array_equal(dark, filled)
         np.testing.assert_array_equal(shaded, ~hidden)
         assert (photo[shaded] > 60).all() and (photo[hidden] == 60).all()
+
+
+def test_what_would_be_brighter_than_lit_ground_is_filled_and_not_lifted() -> None:
+    """Light reaches the foot of an object in ways that its shadow's model does not know. What stands on ground may."""
+    camera = Camera("0", 40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    no, photo = np.zeros((30, 40), bool), np.full((30, 40, 3), 190, np.uint8)
+    light = np.ones((30, 40, 3), np.float32)
+    light[5:25, 5:35] = 0.5
+    photo[5:25, 5:20] = 140  # what half the light leaves of it, about
+    photo[5:25, 20:35] = 180  # nearly all of it arrives
+    photo[15, 10] = 185  # grain
+    ground = np.ones((30, 40), bool)
+    ground[:10] = False
+    window = slice(0, 30), slice(0, 40)
+    witness = Witness(camera, photo, no, no, np.ones((30, 40), np.float32))
+    lifted, shaded, filled, _ = _lifted(witness, Arriving(window, light, ground, 192.0))
+    assert shaded.sum() == 600 and abs(int(lifted[20, 8, 0]) - 190) < 8
+    expected = no.copy()
+    expected[10:25, 20:35] = True
+    np.testing.assert_array_equal(filled, expected)
 
 
 def test_light_is_told_at_more_points_than_opencv_samples_at_once() -> None:
