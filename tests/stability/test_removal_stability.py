@@ -223,6 +223,7 @@ def test_without_scenes_the_benchmark_says_so_in_one_line(tmp_path: Path) -> Non
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_two_views_from_one_side_find_the_table(shared_data: Path) -> None:
     """Half of two views hide whatever one of them does: that tells nothing of what is hidden always."""
     desk = read_scene(shared_data / "withwithout" / "desk", needs_truth=True)

@@ -127,6 +127,8 @@ class _Fit:
     def of(cls, samples: _Samples) -> _Fit:
         found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
         there = samples.seen & (samples.alpha > MIRRORED)
+        if not samples.seen.any():  # few views, or none of one place
+            return cls(found[0], found[1], 0.0, 0.0)
         for channel in range(3):
             weight = samples.seen.astype(np.float64)
             for _ in range(ROUNDS):
