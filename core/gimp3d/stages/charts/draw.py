@@ -29,7 +29,7 @@ UNLIKE = 3.0  # times what photos of the surface differ by, from which they show
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
-UNUSUAL = 99  # percent of surface texels that are less unlike those near them than what is none
+UNUSUAL = 99  # percentile of what surface texels differ by from those near them; mixed ones differ by more
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
@@ -246,7 +246,7 @@ def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
 def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np.ndarray:
     """[N] RMS grey levels by which texels [H, W] bool differ from the most similar ones near by that are known.
 
-    Not at all where none is. Those within MIXED are not asked.
+    0 where none is near. Texels within MIXED px are not compared with, as they may be mixed too.
     """
     rows, cols = np.nonzero(texels)
     least = np.full(len(rows), np.inf, np.float32)
