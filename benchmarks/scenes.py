@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gimp3d.box import Region, read_region
+from gimp3d.box import Box, Region, read_region
 from gimp3d.camera import Camera, output_name
 from gimp3d.commands import select_cameras
 from gimp3d.compute.threads import available_cores, set_thread_count
@@ -31,6 +31,7 @@ MADE = ("desk", "corner", "gloss", "rocks")  # rendered, without shadows
 REAL = ("real_table", "real_bed", "kitchen_monkey", "tiles_mug")
 SHADOW = "_shadow"  # what a made scene's name ends in whose photos show the object's shadows and reflections
 MASKS = ("mask", "unseen")  # what the object hides, and what of it no training view sees
+MOVED, GROWN = 0.015, 0.03  # of a box's edges, by which another user's may lie beside it, and be larger
 AT_ONCE = 2  # removals; each has long parts that use a single core
 
 
@@ -145,13 +146,27 @@ def removal(
     picture: np.ndarray | None = None,
     views: Sequence[View] | None = None,
     observer: Observer = unobserved,
+    region: Region | None = None,  # where another than the scene's is drawn round the object
 ) -> RemovalResult:
     """A removal of the scene's object with the training or other views; a reference that is none of them is drawn."""
     given = list(scene.views if views is None else views)
     if reference is not None and reference.id not in {v.camera.id for v in given}:
         given.append(scene.drawn(reference))
     name = None if reference is None else reference.id
-    return remove_object(scene.gaussians, given, scene.region, settings, name, picture, observer=observer)
+    return remove_object(scene.gaussians, given, region or scene.region, settings, name, picture, observer=observer)
+
+
+def redrawn(region: Region, number: int) -> Region:
+    """The boxes as the user `number` may draw them: up to MOVED beside them and GROWN larger; those of 0 are given."""
+    if not number:
+        return region
+    rng = np.random.default_rng(number)
+
+    def of(box: Box) -> Box:
+        move, growth = rng.uniform(-MOVED, MOVED, 3), rng.uniform(0, GROWN, 3)
+        return Box(box.center + box.axes @ (move * box.size), box.size * (1 + growth), box.rotation_wxyz)
+
+    return tuple(of(box) for box in region)
 
 
 def filled(gaussians: Gaussians, result: RemovalResult) -> Gaussians:

@@ -93,7 +93,7 @@ def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[LaidPlane])
 
 
 def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, charts: Sequence[Chart]) -> Selection:
-    """The selection without the sunk rows [M] in whose place photos show a surface: no box cuts that out.
+    """The selection without the sunk rows [M] in whose place photos agree on a surface: no box cuts that out.
 
     The charts are drawn as if these rows hid nothing, so few photos would take the object for the surface.
     """
@@ -101,7 +101,7 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     for chart in (c for c in charts if c.photos.max() >= AGREEING):
         index, *at, z = framed(chart.camera, scene.means[sunk].astype(np.float64))
         texels = tuple(at)
-        shown = (chart.there & (chart.photos > 0) & ~chart.hole & ~chart.below)[texels]
+        shown = (chart.there & chart.known & ~chart.below)[texels]
         fates[sunk[index[shown & (z > chart.depth[texels])]]] = Fate.KEPT_SURFACE
     return Selection(fates)
 

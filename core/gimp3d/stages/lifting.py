@@ -225,15 +225,15 @@ def _recoloured(
     change, now = np.zeros((len(rows), bands, 3)), lit
     for _ in range(CORRECTIONS):
         asked = [(region, now, mask, photos[k]) for region, mask, k in zip(regions, masks, looks)]
-        bends = np.tile(HOLD * np.eye(bands), (len(rows), 1, 1))
-        slopes = np.zeros_like(change)
+        bends = np.tile(HOLD * np.eye(bands), (len(rows), 3, 1, 1))  # a channel that is clamped at 0 has no weight
+        slopes = np.zeros((len(rows), 3, bands))
         for (weight, missing), basis, steady in zip(
             parallel_map(lambda of: missing_colours(*of), asked), bases, weights[:, 0, rows]
         ):
-            bends += ((weight[:, :1] + steady[:, None]) * basis)[:, :, None] * basis[:, None]
-            here = missing + weight[:, :1] * np.einsum("mk,mkc->mc", basis, change)
-            slopes += basis[:, :, None] * here[:, None]
-        change = np.linalg.solve(bends, slopes)
+            bends += (weight + steady[:, None])[..., None, None] * (basis[:, :, None] * basis[:, None])[:, None]
+            here = missing + weight * np.einsum("mk,mkc->mc", basis, change)
+            slopes += here[..., None] * basis[:, None]
+        change = np.linalg.solve(bends, slopes[..., None])[..., 0].transpose(0, 2, 1)
         sh = lit.sh.copy()
         sh[:, :bands] += change
         now = replace(lit, sh=sh)

@@ -520,8 +520,9 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
     image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
     shown = draw._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no)
-    _, rests = draw._told_by_colours(shown, image[hole], no, no)
+    _, rests, foreign = draw._told_by_colours(shown, image[hole], no, no)
     assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
+    assert foreign[disputed].all() and not foreign[known].any()
     assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed
     assert rests[12:18, 37:44].sum() == 1
 

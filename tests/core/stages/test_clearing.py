@@ -198,10 +198,12 @@ def test_sunk_splats_stay_where_photos_show_the_surface(plain: Removal, charts: 
     col, row = uv[0].astype(int)
     rests = np.zeros_like(chart.rests)
     rests[row - 3 : row + 4, col - 3 : col + 4] = True
-    chart = replace(chart, rests=rests, hole=chart.hole | rests)
+    chart = replace(chart, rests=rests, hole=chart.hole | rests, known=chart.known & ~rests)
     sunk = len(plain.scene) + np.arange(4)
     fates = with_surface(selection, whole, sunk, (chart,)).fates[len(plain.scene) :]
     assert list(fates) == [Fate.KEPT_SURFACE] + [Fate.REMOVED_INSIDE] * 3
+    disputed = replace(chart, known=np.zeros_like(chart.known))  # a foot that stands there, in each photo elsewhere
+    assert (with_surface(selection, whole, sunk, (disputed,)).fates[len(plain.scene) :] == Fate.REMOVED_INSIDE).all()
     for few in (1, 2):  # with these rows away, few photos show whatever they show
         hardly = replace(chart, photos=np.minimum(chart.photos, few))
         assert (with_surface(selection, whole, sunk, (hardly,)).fates[len(plain.scene) :] == Fate.REMOVED_INSIDE).all()

@@ -126,7 +126,7 @@ def _chart(one: LaidPlane, region: Region, witnesses: Sequence[Witness], marked:
     scatter = _scatter(surface.texels, one.others, witnesses)
     tolerance = max(TOLERANCE, scatter)
     shown = _shown(surface.points, plane, witnesses, tolerance)
-    below, rests = _told_by_colours(
+    below, rests, foreign = _told_by_colours(
         shown,
         _object_colours(plane, witnesses, tolerance),
         in_region(region, surface.texels).reshape(surface.depth.shape),
@@ -140,7 +140,7 @@ def _chart(one: LaidPlane, region: Region, witnesses: Sequence[Witness], marked:
         surface.depth,
         shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
-        known=(shown.known | below) & ~hole,
+        known=(shown.known | below) & ~hole & ~foreign,
         hole=hole,
         kind=surface.kind,
         photos=np.where(below, shown.hiding, shown.photos),
@@ -203,8 +203,9 @@ def _told_by_colours(
     object_colours: np.ndarray,  # [N, 3] uint8
     inside: np.ndarray,  # [H, W] bool, texels in the region
     marked: np.ndarray,  # [H, W] bool, texels that are filled whatever photos show
-) -> tuple[np.ndarray, np.ndarray]:
-    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there. And
+    what looks like the object, though photos do not agree that it lies there: it stands before the surface.
 
     Where photos agree below it, and on the surface's colours, they show the surface. Texels right beside the object's
     mix with it.
@@ -220,7 +221,7 @@ def _told_by_colours(
     spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
     rests = (rests | dilated(spots, MIXED)) & (s.photos > 0)
     hole = (s.hole & ~below) | rests
-    return below, rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0))
+    return below, rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0)), object_ & ~s.alike
 
 
 def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:

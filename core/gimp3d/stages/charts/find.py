@@ -26,7 +26,6 @@ GATHERED = 100_000  # points of surface at most, of all views
 HIDDEN = 0.15  # share of the views by which the object hides a point of surface that tells of what it hid
 INLIER = 0.03  # diagonals of the region up to which such a point lies on a plane
 MOST = 4  # planes that are tried: a floor, two walls, and one that rough depths make up
-RIVAL = 1.1  # how much better photos must agree on a further plane than on those before it, for the points on it
 LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
 POINTS = 96  # along a side, at which photos are compared at the finest level …
 OWN = 4  # … and one for so many of these that led to the plane: more of them tilt it (two planes on real_bed)
@@ -42,7 +41,7 @@ class ChartSettings:
     """How surfaces are found and shown."""
 
     least: float = 0.1  # share of the points round the object; fewer planes against missed ones
-    relief: Share = 0.9  # share of what photos disagree on, on the plane; rather planes, or rather reliefs
+    relief: Share = 0.9  # share of what photos disagree on, on a plane; rather it alone, or reliefs and further planes
     largest: AtLeastOne = 900  # px, side of a chart at most; detail against time
 
 
@@ -150,8 +149,8 @@ def find_planes(
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
     for _, plane, claim in found:
-        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=-math.inf)
-        if textures.agreement(claim.own.on(plane)) >= RIVAL * before:
+        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=-1.0)
+        if 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
             planes.append(plane)
     return tuple(planes)
 
