@@ -36,6 +36,13 @@ class Behind:
     charts: tuple[Chart, ...]
     lit: Relit
 
+    def recoloured(self, kept: Gaussians, rows: np.ndarray) -> Behind:
+        """With what stays, of which the rows [M] have other colours now."""
+        stays = np.flatnonzero(~self.masks.removed)
+        sh = self.scene.sh.copy()
+        sh[stays[rows]] = kept.sh[rows]
+        return replace(self, scene=replace(self.scene, sh=sh), changed=np.union1d(self.changed, stays[rows]))
+
 
 def look_behind(
     run: Run,

@@ -38,6 +38,7 @@ from .steps.completion import (
     texels_to_fill,
 )
 from .steps.coverage import after_reference, emptied
+from .steps.relearning import take_painted_colours
 from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
@@ -52,6 +53,7 @@ class Filling:
     views: tuple[ViewState, ...]
     added: Gaussians | None = None
     done: tuple[Reference, ...] = ()  # completed references
+    recoloured: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # rows of `kept` that are not as they came
     asked: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts
 
     @property
@@ -169,3 +171,11 @@ def refine(run: Run, filling: Filling) -> Filling:
     seen = [o for o in seen if o.weight.any()]
     inputs = filling.kept, filling.added, seen, settings.refine, settings.random_seed, run.progress
     return replace(filling, added=run("refine", refine_gaussians, *inputs).gaussians)
+
+
+def recolour(run: Run, filling: Filling) -> Filling:
+    """What is drawn before the new Gaussians, in the colours painted there; without refinement it is left alone."""
+    if filling.added is None or run.settings.charts is None or not run.settings.refine.steps:
+        return filling
+    found = run("recolour", take_painted_colours, filling.kept, filling.added, filling.views)
+    return replace(filling, kept=found.scene(filling.kept), recoloured=found.rows)

@@ -13,7 +13,7 @@ ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the 
 ON_VIEWS = ("reference", "depth", "mapping")  # … and of the latter
 ORDER = (
     "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "relearn", "reference", "depth", "appearance",
-    "seed", "mapping", "propagate", "settle", "refine", "verdict",
+    "seed", "mapping", "propagate", "settle", "refine", "recolour", "verdict",
 )  # fmt: skip
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
@@ -35,6 +35,7 @@ STAGES = {
     "verdict": (0.26, 0.046, 0.049),
 }
 STEP = (0.00044, 0.03595)  # s of a step of refinement: constant, for each million pixels of a view
+RECOLOUR = (0.3, 0.04, 0.0)  # s, as in STAGES
 PAPER_STEP = (0.0, 0.14118)  # the same for the paper's, which move everything
 MEMORY_MB = (318.0, 57.0, 316.0)  # constant, for each million pixels of all views, for each million Gaussians
 
@@ -66,6 +67,7 @@ def forecast_removal(
         stages["refine"] = steps * _sum(STEP if charted else PAPER_STEP, (1.0, pixels / 1e6 / max(1, views)))
         if charted:
             stages["relearn"] = stages["refine"]  # as many steps, over about as many pixels
+            stages["recolour"] = _sum(RECOLOUR, work)
     memory_mb = _sum(MEMORY_MB, (1.0, pixels / 1e6, gaussians / 1e6))
     return Forecast({name: stages[name] for name in ORDER if name in stages}, memory_mb)
 

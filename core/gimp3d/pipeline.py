@@ -12,7 +12,7 @@ from .behind import Behind, look_behind
 from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
-from .filling import Filling, ask_for_refinement, fill_hole, refine
+from .filling import Filling, ask_for_refinement, fill_hole, recolour, refine
 from .frame import frame_of
 from .gaussians import Gaussians
 from .presets import PRESETS, RemovalSettings
@@ -125,7 +125,8 @@ def _remove(
     filling = Filling(behind.scene.take(~masks.removed), behind.views)
     if masks.hole_pixels:
         filling = fill_hole(run, filling, behind.charts, turns)
-        filling = refine(run, ask_for_refinement(run, filling))
+        filling = recolour(run, refine(run, ask_for_refinement(run, filling)))
+        behind = behind.recoloured(filling.kept, filling.recoloured)
     else:
         why = "every view sees what is behind the object"
         if masks.mode == "paper":

@@ -9,16 +9,14 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..gaussians import SH_C0, Gaussians
-from ..geometry import Window, dilated, directions, window_round
-from ..raster import label_weights, pixel_region
-from ..sh import sh_basis
+from ..gaussians import Gaussians
+from ..geometry import Window, dilated, window_round
 from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
 from .charts.hits import Hits, first_hits, pictured
 from .ground import Ground
+from .recolour import recoloured
 from .reflection import VISIBLE, Reflection
-from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow
 from .witness import Witness
 
@@ -32,9 +30,6 @@ PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
 MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
-LOOKS = 12  # views by which colours are corrected
-CORRECTIONS, HOLD = 10, 0.03  # steps of least squares, and px of blend weight by which the old colours are held
-SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,7 @@ def lift_shadow(
     arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
     photos, shaded, dark, light = zip(*parallel_map(lambda p: _lifted(*p), list(zip(witnesses, arriving))))
     clear = [s & ~d for s, d in zip(shaded, dark)]
-    rows, sh = _recoloured(scene, removed, witnesses, photos, shaded, clear, 0)
+    rows, sh = recoloured(scene, removed, witnesses, photos, shaded, clear, 0)
     share = np.mean([s.mean() for s in shaded])
     words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
     before = tuple(w.photo for w in witnesses)
@@ -188,58 +183,6 @@ def _mixed(witness: Witness) -> np.ndarray:
     return dilated(witness.hidden | witness.beside, 2)
 
 
-def _recoloured(
-    scene: Gaussians,
-    removed: np.ndarray,
-    witnesses: Sequence[Witness],
-    photos: Sequence[np.ndarray],  # as they would be
-    changed: Sequence[np.ndarray],  # [H, W] bool, where they are not as they were
-    clear: Sequence[np.ndarray],  # [H, W] bool, … and can be believed, but beside the object
-    degree: int,  # of the SH that are corrected
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [M] of what shows in changed pixels, and colours [M, K, 3] by which the scene, drawn, shows the new photos.
-
-    Least squares (SIRT) over the views that show most of the change; held where photos stay as they are.
-    """
-    stays = np.flatnonzero(~removed)
-    kept = scene.take(stays)
-    looks = sorted(range(len(changed)), key=lambda k: -int(changed[k].sum()))[:LOOKS]
-    looks = [k for k in looks if changed[k].any()]
-
-    def shown(k: int) -> np.ndarray:
-        labels = np.where(witnesses[k].hidden, 0, 1 + changed[k]).astype(np.uint8)
-        return label_weights(kept, witnesses[k].camera, labels, 2)
-
-    weights = np.array(parallel_map(shown, looks)).reshape(-1, 2, len(kept))
-    rows = np.flatnonzero(weights[:, 1].sum(0) > SHOWN)
-    if not len(rows):
-        return stays[rows], scene.sh[stays[rows]]
-    others = np.ones(len(kept), bool)
-    others[rows] = False
-    rest, lit, bands = kept.take(others), kept.take(rows), (degree + 1) ** 2
-    masks = [clear[k] & ~witnesses[k].beside for k in looks]
-    cameras = [witnesses[k].camera for k in looks]
-    passes = frozenset({"rgb"})
-    regions = parallel_map(lambda p: pixel_region(rest, *p, passes=passes), list(zip(cameras, masks)))
-    bases = [sh_basis(directions(lit.means.astype(np.float64), c), degree) / SH_C0 for c in cameras]
-    change, now = np.zeros((len(rows), bands, 3)), lit
-    for _ in range(CORRECTIONS):
-        asked = [(region, now, mask, photos[k]) for region, mask, k in zip(regions, masks, looks)]
-        bends = np.tile(HOLD * np.eye(bands), (len(rows), 3, 1, 1))  # a channel that is clamped at 0 has no weight
-        slopes = np.zeros((len(rows), 3, bands))
-        for (weight, missing), basis, steady in zip(
-            parallel_map(lambda of: missing_colours(*of), asked), bases, weights[:, 0, rows]
-        ):
-            bends += (weight + steady[:, None])[..., None, None] * (basis[:, :, None] * basis[:, None])[:, None]
-            here = missing + weight * np.einsum("mk,mkc->mc", basis, change)
-            slopes += here[..., None] * basis[:, None]
-        change = np.linalg.solve(bends, slopes[..., None])[..., 0].transpose(0, 2, 1)
-        sh = lit.sh.copy()
-        sh[:, :bands] += change
-        now = replace(lit, sh=sh)
-    return stays[rows], now.sh
-
-
 def bare_photos(
     reflection: Reflection, witnesses: Sequence[Witness]
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -272,7 +215,7 @@ def subtract_reflection(
     all of their SH are corrected.
     """
     photos, changed, light = zip(*bare_photos(reflection, witnesses))
-    rows, sh = _recoloured(scene, removed, witnesses, photos, changed, changed, scene.sh_degree)
+    rows, sh = recoloured(scene, removed, witnesses, photos, changed, changed, scene.sh_degree)
     dark = tuple(np.zeros_like(c) for c in changed)
     before = tuple(w.photo for w in witnesses)
     share = np.mean([c.mean() for c in changed])

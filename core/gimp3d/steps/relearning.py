@@ -1,4 +1,8 @@
-"""What stays round the object, learned again: its splats were fitted with the object's before and among them."""
+"""What stays round the object, learned again: its splats were fitted with the object's before and among them.
+
+And after the hole is filled, what is drawn before the new Gaussians takes their colours: where drawn depths scatter,
+splats of the floor lie before the floor that photos tell.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,16 @@ import cv2
 import numpy as np
 
 from ..box import Region
-from ..gaussians import Gaussians
+from ..gaussians import SH_C0, Gaussians
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
 from ..stages.charts import Chart, extent, pictured
+from ..stages.recolour import recoloured
 from ..stages.refine import Observation, looked_at, refine_gaussians
+from ..stages.seed import OWN_RULES
 from ..stages.selection import near_region
-from ..stages.witness import total_over
+from ..stages.witness import Witness, total_over
 from ..view_state import ViewState
 from .coverage import emptied
 
@@ -27,6 +33,7 @@ SHOWN = 2.0  # px of blend weight in the object's place, over all views, from wh
 SHARE = 0.1  # of all its weight; what draws other places more than this one is left alone
 LARGEST = 0.5  # diagonals of the region, σ: giants of the background show in many places
 SMOOTHING = 1.0  # px, σ by which splats and charts are blurred before they are compared
+VISIBLE = 0.5 / 255  # change of a Gaussian's colour from which it shows
 WRONG = 2.0  # times the charts' usual error beyond which what is drawn in the object's place is none of the surface
 
 
@@ -86,6 +93,28 @@ def relearn(
     rows = np.flatnonzero(~removed)[learns] if refined.steps else np.zeros(0, int)
     reason = f"{len(rows)} Gaussians round the object: {refined.reason}"
     return Relearned(rows, refined.gaussians.take(np.arange(len(rows))), refined.confidence, reason)
+
+
+def take_painted_colours(kept: Gaussians, added: Gaussians, views: Sequence[ViewState]) -> Relearned:
+    """The kept Gaussians that show where views are painted, in colours by which the filled scene shows what is painted.
+
+    What they show elsewhere holds them.
+    """
+    painted = [(v, np.isin(v.rules, OWN_RULES)) for v in views if v.rules is not None]
+    of_object = [(v.masks.silhouette | v.masks.target) & ~own for v, own in painted]
+    witnesses = [
+        Witness(v.camera, v.painted, hidden, np.zeros_like(hidden), v.masks.depth_before)
+        for (v, _), hidden in zip(painted, of_object)
+    ]
+    whole, wanted = kept.extended(added), [own for _, own in painted]
+    may = (np.arange(len(whole)) < len(kept)) & whole.usable & np.isfinite(whole.opacity_logits)
+    rows, sh = recoloured(
+        whole, np.zeros(len(whole), bool), witnesses, [v.painted for v, _ in painted], wanted, wanted, 0, may
+    )
+    seen = np.abs(sh[:, 0] - kept.sh[rows, 0]).max(1) > VISIBLE / SH_C0
+    rows, sh = rows[seen], sh[seen]
+    reason = f"{len(rows)} Gaussians before the new ones take the colours that are painted there"
+    return Relearned(rows, replace(kept.take(rows), sh=sh), 1.0, reason)
 
 
 def observed_round(view: ViewState, charts: Sequence[Chart]) -> Observation:

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scenes import BLOCK, REGION, cameras, scene
+from scenes import BLOCK, REGION, cameras, floor, scene
 
 from gimp3d.behind import Behind, look_behind
 from gimp3d.evaluate.metrics import psnr
@@ -18,8 +18,9 @@ from gimp3d.run import Run
 from gimp3d.stages import refine
 from gimp3d.stages.charts import pictured
 from gimp3d.stages.masks import find_masks
+from gimp3d.stages.propagate import Rule
 from gimp3d.steps.coverage import emptied
-from gimp3d.steps.relearning import observed_round
+from gimp3d.steps.relearning import observed_round, take_painted_colours
 
 SETTINGS = replace(PRESETS["balanced"], refine=replace(PRESETS["balanced"].refine, steps=50), shadow="off")
 SPOILT = 0.3  # scene units round the block
@@ -117,3 +118,30 @@ def test_charts_teach_what_cannot_be_true() -> None:
         assert not (taught & ~place).any()
         np.testing.assert_array_equal(seen.image[taught], shown[taught])
         assert taught[patch & place].mean() < 0.5 if few else taught[patch & place].all()
+
+
+def test_what_is_drawn_before_the_new_gaussians_takes_their_colours() -> None:
+    """A shadow on splats that stay: new Gaussians behind them cannot lighten it."""
+    clean = floor(with_hole=False)
+    reach = np.abs(clean.means[:, :2]).max(1)
+    shadow, sh = reach < BLOCK / 2, clean.sh.copy()
+    sh[shadow, 0] -= 0.6
+    kept, added = replace(clean, sh=sh), clean.take(np.arange(len(clean)) == int(np.argmax(reach)))
+    seen = []
+    for v in behind().views:
+        place = v.masks.silhouette | v.masks.target
+        rules = np.where(place, Rule.OWN_PIXELS, Rule.UNTOUCHED).astype(np.uint8)
+        seen.append(replace(v, painted=render_bytes(clean, v.camera), rules=rules))
+
+    def error(gaussians: Gaussians) -> float:
+        drawn = [(v, render_bytes(gaussians, v.camera)) for v in seen]
+        return float(np.mean([psnr(d, v.painted, v.rules == Rule.OWN_PIXELS) for v, d in drawn]))
+
+    found = take_painted_colours(kept, added, seen)
+    after = found.scene(kept)
+    assert error(kept) < 30 and error(after) > error(kept) + 10
+    assert (reach[found.rows] < 3 * BLOCK).all() and np.isin(np.flatnonzero(shadow), found.rows).mean() > 0.9
+    assert (
+        after.sh[np.setdiff1d(np.arange(len(kept)), found.rows)]
+        == kept.sh[np.setdiff1d(np.arange(len(kept)), found.rows)]
+    ).all()
