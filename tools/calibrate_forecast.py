@@ -108,10 +108,10 @@ def measure(folder: Path, preset: str, work: Path) -> Run:
 def fitted(runs: list[Run]) -> dict[str, Any]:
     """The constants that forecast.py names, each stage's own."""
     stages = {}
-    for name in STAGES:
+    for name in (*STAGES, "recolour"):
         had = [r for r in runs if name in r.stages and (r.preset in CHARTED or name in ON_VIEWS)]
         stages[name] = fit([[1.0, r.megapixels, r.millions * r.views] for r in had], [r.of_stage(name) for r in had])
-    constants: dict[str, Any] = {"STAGES": stages}
+    constants: dict[str, Any] = {"RECOLOUR": stages.pop("recolour"), "STAGES": stages}
     for name, charted in (("STEP", True), ("PAPER_STEP", False)):
         had = [r for r in runs if STEPS.get(r.preset, 0) and (r.preset in CHARTED) == charted]
         steps = [[STEPS[r.preset] * x for x in (1.0, r.megapixels / r.views)] for r in had]
