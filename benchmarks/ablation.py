@@ -46,6 +46,13 @@ def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
     return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
 
 
+def _known_if_shown(give: Callable[..., Any]) -> Callable[..., Any]:
+    def to_surface(selection: Any, scene: Any, sunk: Any, charts: Sequence[Any]) -> Any:
+        return give(selection, scene, sunk, [replace(c, known=c.there & (c.photos > 0) & ~c.hole) for c in charts])
+
+    return to_surface
+
+
 ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
 BY_PLACE_ALONE = Around(lambda besides: lambda surface, bent: besides(surface, bent)[:, : 5 if bent else 2])
 RULES: dict[str, tuple[Switch, ...]] = {
@@ -68,6 +75,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what a box cuts out of a surface counts as the object": (
         ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
     ),
+    "a surface need not be agreed on to get back what a box cut out": (
+        ("gimp3d.steps.surfaces:with_surface", Around(_known_if_shown)),
+    ),
     "photos of rests vouch for them, and are not filled": (
         ("gimp3d.steps.surfaces:hiding_rests", lambda witnesses, _: witnesses),
     ),
@@ -85,6 +95,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "charts teach what stays nothing": (("gimp3d.steps.relearning:WRONG", math.inf),),
     "shapes of what stays learn too": (("gimp3d.steps.relearning:LEARNED", ARRAYS),),
     "what draws other places more learns too": (("gimp3d.steps.relearning:SHARE", 0.0),),
+    "what is drawn before new Gaussians keeps its colours": (("gimp3d.steps.relearning:VISIBLE", math.inf),),
     # into the other views
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
