@@ -75,6 +75,7 @@ def variant_facts(out: Path, result: RemovalResult) -> dict[str, Any]:
     return {
         "out": str(out),
         "added": len(result.added) if result.added else 0,
+        "changed": result.changed,
         "open_pixels": result.open_pixels,
         "score": result.verdict.score if result.verdict else None,
     }
