@@ -25,12 +25,11 @@ from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.exemplar import EDGE
 
 from .command import kept, parser_of, say, told_in_one_line, write
-from .scenes import MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
+from .scenes import BUILT_IN, GIVEN, MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
 from .tables import Row, Section, markdown
 from .timing import Watch, about, machine, replaced
 
 SCENES = (*MADE, "desk_shadow", "corner_shadow", *REAL)
-GIVEN, BUILT_IN = "given", "built-in"  # the first test view's true picture is the reference, or none is given
 PRESET = "balanced"
 Switch = tuple[str, Any]  # what, and its value when the rule is off
 

@@ -15,11 +15,10 @@ from gimp3d.errors import BadInput, IllPosed
 from gimp3d.pipeline import PRESETS
 
 from .command import kept, parser_of, say, told_in_one_line, write
-from .scenes import MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, redrawn, removal
+from .scenes import BUILT_IN, GIVEN, MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, redrawn, removal
 from .tables import Row, Section, markdown
 from .timing import about, machine
 
-GIVEN, BUILT_IN = "given", "built-in"
 BOXES = 6  # drawn by others, beside the scene's own
 
 

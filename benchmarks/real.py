@@ -28,12 +28,11 @@ from gimp3d.io.ply import read_ply, write_ply
 from gimp3d.raster import surface_depth
 
 from .command import parser_of, say, told_in_one_line, write, write_results
-from .scenes import MADE, REAL, Scene, gimp3d, read_scenes, remove_words, scene_words, shadow_words
+from .scenes import BUILT_IN, GIVEN, MADE, REAL, Scene, gimp3d, read_scenes, remove_words, scene_words, shadow_words
 from .tables import Row, Section, columns, distance_to, markdown, sheet, values, where
 from .timing import about, machine
 
 SCENES = (*REAL, "kitchen_480")
-GIVEN, BUILT_IN = "given", "built-in"
 EMPTIED, TELEA, PAPER = "emptied box", "telea", "paper"
 BASELINES = (EMPTIED, TELEA, PAPER)
 PRESETS = ("draft", "balanced", "best", PAPER)

@@ -31,6 +31,7 @@ MADE = ("desk", "corner", "gloss", "rocks")  # rendered, without shadows
 REAL = ("real_table", "real_bed", "kitchen_monkey", "tiles_mug")
 SHADOW = "_shadow"  # what a made scene's name ends in whose photos show the object's shadows and reflections
 MASKS = ("mask", "unseen")  # what the object hides, and what of it no training view sees
+GIVEN, BUILT_IN = "given", "built-in"  # the first test view's true picture is the reference, or none is given
 MOVED, GROWN = 0.015, 0.03  # of a box's edges, by which another user's may lie beside it, and be larger
 AT_ONCE = 2  # removals; each has long parts that use a single core
 

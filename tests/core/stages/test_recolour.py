@@ -35,8 +35,6 @@ def test_a_channel_that_a_gaussian_cannot_show_is_left_alone() -> None:
     rows, sh = recoloured(black, no.ravel()[:count], [witness], [lifted], [~no], [~no], 0)
     assert len(rows) > count / 2 and (sh[:, 0, 0] == -3).all()
     assert np.abs(sh - black.sh[rows]).max() < 3
-    after = render_bytes(replace(black, sh=black.sh.copy()).take(rows), camera)
-    assert after.max() <= drawn.max() + 1
     shown = black.sh.copy()
     shown[rows] = sh
     assert (

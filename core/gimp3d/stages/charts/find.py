@@ -149,8 +149,8 @@ def find_planes(
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
     for _, plane, claim in found:
-        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=-1.0)
-        if 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
+        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=0.0)
+        if not planes or 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
             planes.append(plane)
     return tuple(planes)
 
