@@ -132,7 +132,7 @@ def _chart(one: LaidPlane, region: Region, witnesses: Sequence[Witness], marked:
         in_region(region, surface.texels).reshape(surface.depth.shape),
         _marked(surface.texels, witnesses, marked, surface.depth.shape),
     )
-    hole = _without_islands((shown.hole & ~below) | rests, (shown.photos < 2) & shown.there)
+    hole = _without_islands((shown.hole & ~below) | rests, ((shown.photos < 2) & shown.there) | below)
     below &= ~hole
     return Chart(
         plane,
