@@ -116,6 +116,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
     "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[0] * 6])),),
     "edges of one step are": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[1] * 3, *[0] * 3])),),
+    "patches expect no colours": (("gimp3d.solvers.exemplar:EXPECTED", 0.0),),
     "averages of patches stay": (("gimp3d.solvers.exemplar:COPIED", 0.0), ("gimp3d.solvers.exemplar:MOSAICS", 0)),
     "what is copied is not matched again": (("gimp3d.solvers.exemplar:MOSAICS", 0),),
     "votes have no say in the mosaic": (("gimp3d.solvers.exemplar:COPIED", 1.0),),

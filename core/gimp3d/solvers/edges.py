@@ -31,6 +31,7 @@ FAR_ABOVE, ABOVE, BELOW, FAR_BELOW = slice(0, 3), slice(3, 5), slice(5, 7), slic
 SHARP = 0.5  # share of the step between what is further from it that it must be: else it is a slope
 BLOCKS, CLOSEST = 5, 3  # that what tells it on either side is cut into, and how many of them it must reach through
 STEADY = 0.5  # share of the usual step that it is in each
+CLOSE = 4  # px beyond the hole, with the colours on both sides of an edge, that tell that it runs on to there
 BLOCK = 8  # px, in each of which it is that further off, as far as it goes
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
@@ -117,7 +118,7 @@ class _Half:
 
     edge: Edge
     enters: float  # px along it, where it runs into the hole
-    leaves: float  # and out of it
+    leaves: float  # and out of it, or ends beyond
     goes_on: bool  # what is known beyond the hole does not tell that it ends
 
     @property
@@ -239,7 +240,7 @@ def _settled(
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
         if not len(cut):
             return 0.0, None
-        sides, ends, steady, dark = [], [], True, False
+        sides, ends, steady, told_by, beyond = [], [], True, np.zeros(0), np.zeros(0)
         for number, (start, step) in enumerate(((cut.min() - 1, -1), (cut.max() + 1, 1))):
             t = start + step * np.arange(FURTHEST * REACH)
             grid = origin + t[None, :, None] * along + ROWS[:, None, None] * across
@@ -250,9 +251,10 @@ def _settled(
             near = sums * (there.cumsum(1) <= REACH)
             pair = tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW))
             if side not in (BOTH, BEFORE + number):
-                dark = min(p[0, 0] for p in pair) < 2 * LEAST
+                beyond = near
                 ends.append(start)
                 continue
+            told_by = near
             sides.append(pair)
             steady = steady and _is_edge(near) and (side == BOTH or _is_border(near))
             ends.append(float(t[_length(sums, _step(near))]))
@@ -261,8 +263,12 @@ def _settled(
         edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), np.mean(means, (0, 1)))
         if not steady or side == BOTH:
             return told, edge if steady else None
-        way = (cut.min(), cut.max()) if side == BEFORE else (cut.max(), cut.min())
-        return told, _Half(edge, float(way[0]), float(way[1]), dark)
+        inwards = 1 if side == BEFORE else -1
+        enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
+        if _goes_on(beyond[:, :CLOSE], told_by):
+            return told, _Half(edge, enters, leaves + inwards * CLOSE, True)
+        dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
+        return told, _Half(edge, enters, leaves, bool(dark))
 
     values, step = np.zeros(2), 1.0
     best = at(values)
@@ -302,6 +308,15 @@ def _is_border(sums: np.ndarray) -> bool:
     """Whether it parts two regions: a thin line, or one of a texture's, has the same colours further off again."""
     whole = _step(sums)
     return bool(_step(sums, FAR_ABOVE, FAR_BELOW) @ whole >= STEADY * (whole @ whole))
+
+
+def _goes_on(beyond: np.ndarray, told_by: np.ndarray) -> bool:
+    """Whether what lies beyond the hole has the colours of both sides of an edge: a corner may follow soon."""
+    far = STEADY * float(np.linalg.norm(_step(told_by)))
+    return all(
+        beyond[rows, :, 0].any() and np.linalg.norm(_mean(beyond[rows]) - _mean(told_by[rows])) < far
+        for rows in (ABOVE, BELOW)
+    )
 
 
 def _length(sums: np.ndarray, whole: np.ndarray) -> int:

@@ -7,6 +7,7 @@ one place: an average of what disagrees is smooth.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,6 +17,7 @@ from ..compute.jit import kernel
 from ..compute.threads import run_ranges
 from .edges import Edge, find_edges, guide_of
 from .greedy import fill_inwards
+from .kriging import Expected, expect
 from .patch_index import index_patches
 from .patches import lay_out, repainting
 from .patchmatch import (
@@ -37,6 +39,7 @@ TREE_GRID = 2  # px between the sources that the coarsest level's tree holds
 DISAGREEMENT = 40 / 255  # difference between a rim pixel and what patches say of it from which it is no boundary
 SCREENING = 0.01  # weight of the voted colours beside their gradients
 SELECTIVE = 4.0  # a patch that only a quarter fits worse than votes by e^-4: higher is sharper, and noisier
+EXPECTED = 1.0  # weight of expected colours beside a patch's misfit, where they are as sure
 LEAST_SAY = 1e-12  # of a patch that fits badly
 EDGE = 0.15  # difference in colour that counts as much as being on an edge, or beside it, or not
 GUIDE = np.array([EDGE, EDGE, *[1] * 6], np.float32)  # what differences of guide_of count: an edge's colours as others
@@ -125,12 +128,14 @@ def _by_patches(
     if levels[-1][1].all():
         return None
     field: NearestNeighbourField | None = None
+    expected = expect(image / np.float32(255), hole, ~(hole | unknown))
     for number, (channels, open_) in enumerate(reversed(levels)):
         shape = open_.shape[::-1]
         barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
         rounds = 1 if number else settings.coarse_rounds
+        smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture
         guide = guide_of(edges, open_.shape, 2 ** (len(levels) - 1 - number), max(radius, 1))
-        level = _prepared(channels, open_, barred, GUIDE * guide, radius, settings)
+        level = _prepared(channels, open_, barred, GUIDE * guide, smooth, radius, settings)
         mosaics = MOSAICS if number == len(levels) - 1 else 0
         colours, field = _filled(level, field, rounds, mosaics, settings)
     assert field is not None
@@ -144,6 +149,7 @@ class _Level:
     channels: np.ndarray  # [h, w, 5] float32: colours and texture features
     hole: np.ndarray  # [h, w] bool
     edges: np.ndarray  # [h, w, 8] float32, see guide_of: known in the hole as well
+    expected: Expected  # smooth colours, known in the hole as well
     touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
@@ -156,6 +162,7 @@ def _prepared(
     hole: np.ndarray,
     unknown: np.ndarray,
     edges: np.ndarray,
+    expected: Expected,
     radius: int,
     settings: ExemplarSettings,
 ) -> _Level:
@@ -166,7 +173,7 @@ def _prepared(
     allowed = patch_centres(known, radius)
     inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
     trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, edges, touching, known, allowed, trust, radius)
+    return _Level(channels, hole, edges, expected, touching, known, allowed, trust, radius)
 
 
 def _filled(
@@ -180,6 +187,8 @@ def _filled(
     hole, allowed, radius = level.hole, level.allowed, level.radius
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
     guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
+    doubt = float(np.median(level.expected.variance[hole]))
+    usual = 0.0  # cost of patches that were found; not known at first
     matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps)
     if coarser is None:
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
@@ -187,7 +196,7 @@ def _filled(
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
         index = index_patches(patches, allowed, TREE_GRID)
     else:
-        field = upsampled(coarser, level.touching)
+        field, usual = upsampled(coarser, level.touching), float(np.median(coarser.cost[coarser.found]))
         kept = field.found
         kept[kept] = allowed[field.rows[kept], field.cols[kept]]
         field = replace(field, rows=np.where(kept, field.rows, -1))
@@ -198,12 +207,15 @@ def _filled(
     def matched(
         field: NearestNeighbourField, colours: np.ndarray, number: int
     ) -> tuple[NearestNeighbourField, np.ndarray]:
+        nonlocal usual
         repaint(colours[:, :3])
         guides[hole] = colours[:, 3:]
+        heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
         field = refined(
             field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,
-            index, np.dstack([guides, level.edges]), tree_sweeps=1,
+            index, np.dstack([guides, level.edges, heed * level.expected.colours]), tree_sweeps=1,
         )  # fmt: skip
+        usual = float(np.median(field.cost[level.touching]))
         return field, _voted(level, field, _say(level, field), colours)
 
     for number in range(rounds):

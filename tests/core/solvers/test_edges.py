@@ -99,6 +99,17 @@ def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
     assert len(edges) == 1 and edges[0].origin[0] + edges[0].along[0] * max(edges[0].ends) > MIDDLE + 25
 
 
+@pytest.mark.parametrize(("gap", "goes_on"), [(5, True), (0, False)])
+def test_an_edge_goes_on_to_a_corner_right_beyond_the_hole(gap: int, goes_on: bool) -> None:
+    """A chessboard's: on the hole's other side the next squares soon begin."""
+    squares = np.where((X > 4) ^ (Y + 30 + gap < 0), 150.0, 100.0)
+    edges = [e for e in found(textured(squares, 6)) if abs(e.along[1]) > 0.99]
+    assert len(edges) == goes_on
+    for edge in edges:
+        reached = sorted(edge.origin[1] + t * edge.along[1] - MIDDLE for t in edge.ends)
+        assert -30 - gap < reached[0] < -29 and reached[1] > 60
+
+
 def test_pixels_of_one_guide_lie_at_one_distance() -> None:
     edge = found(textured(np.where(side_of(48, 3) > 0, 150.0, 100.0), 6))[0]
     guide = guide_of((edge,), HOLE.shape, 1, 6)

@@ -17,9 +17,15 @@ def filled(name: str, seed: int = 0) -> np.ndarray:
     return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, ExemplarSettings(seed=seed)).image
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("name", [name for name in PICTURES if name != "rug"])
 def test_edges_are_continued_within_two_pixels(name: str) -> None:
     assert edge_error(filled(name), *PICTURES[name]) < 2
+
+
+def test_a_flower_whose_middle_is_hidden_is_not_filled_with_the_ground() -> None:
+    """Nothing tells its inner petals, of which only the tips are seen: its own red is what its surroundings expect."""
+    truth, hole = PICTURES["rug"]
+    assert psnr(filled("rug"), truth, hole) > 10.5  # with the ground's blue 8.9
 
 
 @pytest.mark.parametrize("name", ["bricks", "book row"])  # of those in which it matters at all

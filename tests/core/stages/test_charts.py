@@ -298,6 +298,23 @@ def test_of_a_mask_that_is_too_large_little_more_than_the_object_stays_hole(
     assert np.abs(c.image[c.below] - texture(texels(c)).reshape(c.image.shape)[c.below]).max() < 20  # floor, not red
 
 
+def test_what_seems_to_be_floor_amid_the_hole_is_part_of_it(floor_room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mask is too large at its rim: what photos show in its middle is the object, however alike they look."""
+    floor = Plane.make(np.zeros(3), UP, REGION)
+    taken = []
+
+    def told(shown: draw._Shown, *_: np.ndarray) -> tuple[np.ndarray, ...]:
+        inner = cv2.erode(shown.hole.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        right = shown.hole & (np.arange(shown.hole.shape[1]) > np.median(np.nonzero(shown.hole)[1]))
+        taken.append(right if taken else inner)
+        return taken[-1].copy(), np.zeros_like(inner), np.zeros_like(inner)
+
+    monkeypatch.setattr(draw, "_told_by_colours", told)
+    amid, beside = (charts_of([floor], floor_room.views, floor_room.witnesses)[0] for _ in range(2))
+    assert taken[0].sum() > 100 and amid.hole[taken[0]].all() and not amid.below.any()
+    assert taken[1].sum() > 100 and beside.below[taken[1]].all() and not beside.hole[taken[1]].any()
+
+
 def test_what_photos_disagree_on_below_the_mask_stays_hole(
     floor_room: Room, wide: list[Witness], wide_chart: Chart
 ) -> None:
