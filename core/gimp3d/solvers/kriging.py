@@ -18,6 +18,7 @@ SIDE = 64  # px: the hole and what is given round it are shrunk to this
 GIVEN, TELLING = 0.3, 2.0  # of the hole's thickness: how far known pixels are given, and tell the covariance
 LEAST_GIVEN = 4  # px
 NUGGET = 0.02  # of the variance: what neighbours do not have in common
+NO_GUESS = 1e3  # variance where nothing is known: far above that of any colours
 ROUNDING = 2.0**-12  # of results: the solver's own hangs on the number of threads
 
 
@@ -55,10 +56,11 @@ def expect(
     picture = small(image * known[..., None]) / np.maximum(share, 1e-3)[..., None]
     there, unknown = share > 0.5, (small(hole) > 0) & (share <= 0.5)
     away = cv2.distanceTransform((~unknown).astype(np.uint8), cv2.DIST_L2, 5)
-    near = there & (away <= max(LEAST_GIVEN, TELLING * thickness * scale))
-    given = there & (away <= reach * scale)
-    variance = np.zeros(there.shape, np.float32)
-    if unknown.any() and given.any():
+    variance = np.where(unknown, np.float32(NO_GUESS), np.float32(0))
+    if unknown.any() and there.any():
+        begins = float(away[there].min()) - 1  # other things may stand all round the hole
+        near = there & (away <= begins + max(LEAST_GIVEN, TELLING * thickness * scale))
+        given = there & (away <= begins + max(LEAST_GIVEN, reach * scale))
         window = bounds(near | unknown)
         picture[unknown], variance[unknown] = _kriged(*(a[window] for a in (picture, unknown, given, near)))
 

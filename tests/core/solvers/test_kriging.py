@@ -83,6 +83,14 @@ def test_a_large_hole_is_looked_at_from_afar_and_a_speck_in_a_sliver_of_a_pictur
     assert np.isfinite(expect(grey(np.full((2, 40), 0.4)), thin, ~thin).colours).all()
 
 
+def test_what_is_known_may_begin_far_from_the_hole_or_nowhere() -> None:
+    far = np.hypot(Y - 27, X - 29) > 25
+    found = expect(np.where(far[..., None], np.float32(0.4), np.float32(0)).repeat(3, -1), HOLE, far)
+    np.testing.assert_allclose(found.colours[HOLE], 0.4, atol=1e-3)
+    nothing = expect(np.zeros((SIDE, SIDE, 3), np.float32), HOLE, np.zeros_like(HOLE))
+    assert np.isfinite(nothing.colours).all() and (nothing.variance[HOLE] == kriging.NO_GUESS).all()
+
+
 def test_it_can_be_had_at_another_size() -> None:
     found = expect(grey(X / SIDE), HOLE, ~HOLE).sized((28, 28), 3)
     assert found.colours.shape == (28, 28, 3) and found.variance.shape == (28, 28)
