@@ -99,6 +99,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
+    "light differs by as much all round the hole": (("gimp3d.stages.propagate.blend:TOLERANCES", (1.0,)),),
     "depth seams do not stop the blend": (("gimp3d.stages.propagate.blend:SEAM", 1e9),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),

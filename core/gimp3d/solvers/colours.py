@@ -24,8 +24,9 @@ def exposure_gain(
 
 def biweight(
     residuals: np.ndarray,  # [N, 3] grey levels
+    tolerance: float = 1.0,  # times CUT
 ) -> np.ndarray:
     """[N] in [0, 1]: how much each counts (Tukey's biweight, scaled by their median length)."""
     squares = np.einsum("nc,nc->n", residuals, residuals)
-    scale = CUT * (1.4826 * np.sqrt(np.median(squares)) + LEAST_NOISE)
+    scale = tolerance * CUT * (1.4826 * np.sqrt(np.median(squares)) + LEAST_NOISE)
     return np.maximum(0.0, 1 - squares / scale**2) ** 2

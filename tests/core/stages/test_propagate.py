@@ -470,6 +470,20 @@ def test_photo_that_shows_something_else_does_not_colour_the_fill() -> None:
     assert np.abs(blended[painted].mean(0) - 120).max() < 2
 
 
+def test_each_side_of_the_hole_has_its_own_light() -> None:
+    base = np.full((60, 100, 3), 120, np.uint8)
+    noise = np.random.default_rng(0).normal(0, 3, base.shape).astype(np.float32)
+    raw = np.full(base.shape, 115.0, np.float32) + noise
+    raw[:, 65:] = 85 + noise[:, 65:]  # the reference saw no gloss there, on a fifth of what lies round the hole
+    painted = np.zeros((60, 100), bool)
+    painted[20:40, 20:75] = True
+    band = ~painted
+    band[:, 85:] = False
+    blended = blend_band(base, raw, painted, band, 4.0, np.ones((60, 100)))
+    assert np.abs(blended[25:35, 72:].mean((0, 1)) - 120).max() < 10
+    assert np.abs(blended[25:35, 25].mean(0) - 120).max() < 4
+
+
 def test_where_hardly_any_photo_touches_the_hole_what_lies_farther_away_tells_its_level() -> None:
     base = np.full((80, 80, 3), 150, np.uint8)
     raw = np.full(base.shape, 130.0, np.float32)

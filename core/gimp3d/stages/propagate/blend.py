@@ -11,6 +11,9 @@ from ...solvers.poisson import solve_poisson
 SEAM = 0.05  # relative depth step between neighbours that parts two surfaces: 2.5 times what depths scatter by
 LEAST_BAND = 20  # px of photo that tell the level of a part
 HOLD = 1 / 16  # weight that holds a correction at its level where no photo is near; over the root of the band's weight
+TOLERANCES = 4.0, 2.0, 1.0  # of a mismatch, round by round
+LOCAL = 2.0  # widths of the band, σ of the neighbourhood that tells what is usual
+LEAST_COUNT = 1e-3  # share of a neighbourhood from which on it tells
 FAR = 4  # widths of the band within which photo still tells
 SQUARE = np.ones((3, 3), np.uint8)
 
@@ -27,8 +30,9 @@ def blend_band(
 
     Minimises Σ |∇c|² + Σ_band w (c − mismatch)² + h Σ (c − level)²: Poisson blending (guidance: the fill's gradients)
     with a soft boundary. A rim of single pixels would carry each one's texture and misregistration into the hole: all
-    photo round it is asked, and w is less where it is farther away, and where the mismatch is not like most. The weak
-    hold h lets what few pixels say fade with the distance. Depth seams stop the correction.
+    photo round it is asked, and w is less where it is farther away, and where the mismatch is not like the others near
+    by (reweighted least squares: Holland and Welsch 1977). The weak hold h lets what few pixels say fade with the
+    distance. Depth seams stop the correction.
     """
     result = base.copy()
     if not painted.any():
@@ -40,10 +44,10 @@ def blend_band(
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
     level = _levels(domain, data, mismatch)
-    weight, hold = 2 / width**2 * np.zeros(data.shape), (HOLD / width) ** 2
+    weight, hold = np.zeros(data.shape), (HOLD / width) ** 2
     if data.any():  # where the two show different things, the difference is none of light
         nearness = 1 / (1 + (distance[data] / width) ** 2)
-        weight[data] = 2 / width**2 * nearness * biweight((mismatch - level)[data])
+        weight[data] = 2 / width**2 * nearness * _alike(mismatch, level, data, LOCAL * width)
     anchor = (weight[..., None] * mismatch + hold * level) / (weight + hold)[..., None]
     correction = solve_poisson(
         domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=weight + hold, anchor=anchor
@@ -52,6 +56,20 @@ def blend_band(
     _continue_over(painted & ~domain, domain, depth, correction)
     result[painted] = to_bytes(raw[painted] + correction[painted])
     return result
+
+
+def _alike(mismatch: np.ndarray, level: np.ndarray, data: np.ndarray, width: float) -> np.ndarray:
+    """[N] in [0, 1]: how much each of the data counts, as its mismatch is like the others' near by.
+
+    A local mean, reweighted (Holland and Welsch 1977): what differs from most may be the light of another place.
+    """
+    mean = level
+    for tolerance in TOLERANCES:
+        counts = np.zeros(data.shape)
+        counts[data] = biweight((mismatch - mean)[data], tolerance)
+        total = cv2.GaussianBlur(counts, (0, 0), width)[..., None] + LEAST_COUNT
+        mean = (cv2.GaussianBlur(counts[..., None] * mismatch, (0, 0), width) + LEAST_COUNT * level) / total
+    return counts[data]
 
 
 def _levels(domain: np.ndarray, data: np.ndarray, values: np.ndarray) -> np.ndarray:
