@@ -28,6 +28,7 @@ from ..view_state import ViewState
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
+CUBIC = np.ones((5, 5), np.uint8)  # px of a picture that a colour between them is made of: none may show the object
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,11 @@ def turns_of(
         return [Turn(named, reference, picture), *(Turn(k) for k in range(len(charts)) if k != named)]
     # A depth prior, or a file that fills, belongs to a view and needs that view.
     of_view = settings.depth_prior != "auto" or settings.inpaint.startswith("file:")
-    views = [Turn(None, reference, picture)]
-    if not left_to_charts(charts, views[0], settings):
-        views += [Turn()] * settings.extra_references
-    return [*(views if not charts or reference is not None or of_view else []), *map(Turn, range(len(charts)))]
+    first, on_charts = Turn(None, reference, picture), [Turn(k) for k in range(len(charts))]
+    if charts and reference is None and not of_view:
+        return on_charts
+    further = [] if left_to_charts(charts, first, settings) else [Turn()] * settings.extra_references
+    return [first, *on_charts, *further]
 
 
 def left_to_charts(charts: Sequence[Chart], turn: Turn, settings: RemovalSettings) -> bool:
@@ -124,7 +126,9 @@ def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
         rows, cols = open_points.T
         uv, _ = reference.camera.project(points[rows, cols])
         same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
-        seen = sees(reference.camera, np.where(reference.target, reference.depth, 0), points[rows, cols], same)
+        clean = cv2.erode((reference.target | reference.source).astype(np.uint8), CUBIC) > 0
+        completed = np.where(reference.target & clean, reference.depth, 0)
+        seen = sees(reference.camera, completed, points[rows, cols], same)
         image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
         photos = chart.photos.copy()
         shown = rows[seen], cols[seen]

@@ -24,7 +24,8 @@ from gimp3d.pipeline import (
     remove_object,
     render_bytes,
 )
-from gimp3d.steps.completion import Turn, turns_of
+from gimp3d.stages.propagate import Reference
+from gimp3d.steps.completion import Turn, carried_over, turns_of
 
 WALL = BLOCK / 2 + 0.02  # y of a wall right behind the block
 CORNER = (Box.make([0, 0, 0.26], [0.52, 0.52, 0.56]),)
@@ -122,3 +123,29 @@ def test_a_chart_that_there_is_not_is_refused(reference: str, count: int, words:
 def test_views_are_no_charts() -> None:
     for name in (None, "view", "chart", "chart:", "chart:one", "my/chart:1"):
         assert turns_of(name, None, (), PRESETS["paper"]) == [Turn(None, name)]
+
+
+def test_after_a_view_whose_picture_is_given_charts_come_before_other_views() -> None:
+    charts, given = cleared(None).charts, np.zeros((120, 160, 3), np.uint8)
+    settings = replace(PRESETS["balanced"], extra_references=1)
+    first = Turn(None, "3", given)
+    assert turns_of("3", given, charts, settings) == [first, Turn(0), Turn(1), Turn()]
+    assert turns_of("3", given, (), settings) == [first, Turn()]
+    assert turns_of(None, None, charts, settings) == [Turn(0), Turn(1)]
+
+
+def test_a_chart_takes_over_nothing_of_what_lies_beside_a_completed_hole() -> None:
+    chart = cleared(None).charts[0]
+    camera = replace(chart.camera, id="view", split="train", cx=chart.camera.cx + 0.5, cy=chart.camera.cy + 0.5)
+    rows = np.argwhere(chart.hole)[:, 0]
+    completed = chart.hole & (
+        np.arange(len(chart.hole))[:, None] < np.median(rows)
+    )  # the object stands before the rest
+    image = np.where(completed[..., None], np.uint8((20, 200, 40)), np.uint8((250, 0, 0)))
+    alone, beside_photo = (
+        carried_over(chart, [Reference(camera, image, chart.depth, completed, source)])
+        for source in (np.zeros_like(chart.hole), ~chart.hole)
+    )
+    new = alone.known & ~chart.known
+    assert new.sum() > 0.1 * chart.hole.sum() and (alone.image[new] == (20, 200, 40)).all()
+    assert (beside_photo.known & ~alone.known).any()  # the rim is as good as the photo beside it
