@@ -32,7 +32,7 @@ class RemovalSettings:
     inpaint: str = "exemplar"  # provider; who paints what no photo shows
     depth_prior: str = "auto"  # provider; where the depth behind the object comes from
     shadow: Literal["auto", "off", "mask"] = "auto"  # look for the object's shadow, leave it, or undo the marked one
-    extra_references: int = 3  # views; completed after the first one, where it does not reach
+    extra_references: int = 3  # views; completed after the first one and the charts, where these do not reach
     extra_gain: Share = 0.01  # share of the hole; that must still be open for an extra reference
     random_seed: Seed = 0  # number; another one gives another texture
     variant: Variant = 0  # number; another one fills with another brush
