@@ -71,7 +71,8 @@ def turns_of(
     if charts and reference is None and not of_view:
         return on_charts
     further = [] if left_to_charts(charts, first, settings) else [Turn()] * settings.extra_references
-    return [first, *on_charts, *further]
+    # whoever tells a view's depth means it to hold beside charts
+    return [first, *on_charts, *further] if settings.depth_prior == "auto" else [first, *further, *on_charts]
 
 
 def left_to_charts(charts: Sequence[Chart], turn: Turn, settings: RemovalSettings) -> bool:

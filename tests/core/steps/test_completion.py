@@ -130,6 +130,8 @@ def test_after_a_view_whose_picture_is_given_charts_come_before_other_views() ->
     settings = replace(PRESETS["balanced"], extra_references=1)
     first = Turn(None, "3", given)
     assert turns_of("3", given, charts, settings) == [first, Turn(0), Turn(1), Turn()]
+    told = replace(settings, depth_prior="onnx:model.onnx")
+    assert turns_of("3", given, charts, told) == [first, Turn(), Turn(0), Turn(1)]
     assert turns_of("3", given, (), settings) == [first, Turn()]
     assert turns_of(None, None, charts, settings) == [Turn(0), Turn(1)]
 
