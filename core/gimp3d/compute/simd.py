@@ -1,4 +1,4 @@
-"""A value type inside numba kernels: 16 float32 lanes, one block of 4×4 pixels.
+"""What kernels compute with: a value of 16 float32 lanes, one block of 4×4 pixels, and functions that vectorise.
 
 LLVM maps `<16 x float>` to one AVX-512 register, two AVX, four SSE or four NEON ones, so that pixels are blended 16
 at a time without relying on the loop vectoriser. Nothing here is fast-math: the forward and the backward kernels
@@ -7,12 +7,16 @@ must come to the same bits. Only what the kernels use is here.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
+from functools import wraps
 from operator import add, mul, sub, truediv
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
+from numba import int64
 from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
@@ -26,6 +30,10 @@ INTEGERS = ir.VectorType(I32, LANES)
 # 2^r on [-0.5, 0.5], highest power first: least relative error, 8e-8, in float32 2e-7 (Taylor: 3e-6)
 EXP2 = (0.00132764714, 0.00967554157, 0.05550713277, 0.24022119720, 0.69314696706, 1.00000007166)
 ROUNDING = 1.5 * 2.0**23  # added to a float32 it leaves the nearest integer in the low mantissa bits
+ROUNDING64 = 1.5 * 2.0**52  # the same for a float64
+LOG2E, LN2 = math.log2(math.e), math.log(2.0)
+MANTISSA_BITS = np.int64(0xFFFFFFFFFFFFF)
+INTEGER_BITS, INTEGER_OFFSET = np.int64(0x4330000000000000), 2.0**52  # float_of(INTEGER_BITS | k) = 2^52 + k
 
 
 class Vec16Type(types.Type):
@@ -95,73 +103,67 @@ def _pointer(context: Any, builder: Any, sig: Any, args: Any, pointee: Any = Non
     return builder.bitcast(pointer, pointee.as_pointer()) if pointee else pointer
 
 
-@intrinsic
-def load16(typing: Any, array: Any, index: Any) -> Any:
+def _intrinsic(typed: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """LLVM code as a function for kernels; `typed` makes its signature of the typing context and arguments' types."""
+
+    def decorate(code: Callable[..., Any]) -> Any:
+        @wraps(typed)  # numba reads the names of the parameters
+        def typer(*given: Any) -> Any:
+            return typed(*given), code
+
+        return intrinsic(typer)
+
+    return decorate
+
+
+@_intrinsic(lambda _, array, index: vec16(array, types.int64))
+def load16(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Lanes array[index : index + 16] of a flat float32 array."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = builder.load(_pointer(context, builder, sig, args, VECTOR))
-        value.align = 4
-        return value
-
-    return vec16(array, types.int64), code
+    value = builder.load(_pointer(context, builder, sig, args, VECTOR))
+    value.align = 4
+    return value
 
 
-@intrinsic
-def store16(typing: Any, array: Any, index: Any, value: Any) -> Any:
+@_intrinsic(lambda _, array, index, value: types.void(array, types.int64, vec16))
+def store16(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """array[index : index + 16] = value."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _pointer(context, builder, sig, args, VECTOR)).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, vec16), code
+    builder.store(args[2], _pointer(context, builder, sig, args, VECTOR)).align = 4
+    return context.get_dummy_value()
 
 
-@intrinsic
-def store_block(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+@_intrinsic(lambda _, array, index, stride, value: types.void(array, types.int64, types.int64, vec16))
+def store_block(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """A block's 4 rows to array[index + row · stride : … + 4]."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        for row in range(4):
-            four = _shuffle(builder, args[3], args[3], list(range(4 * row, 4 * row + 4)))
-            builder.store(four, _pointer(context, builder, sig, args, four.type, row)).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64, vec16), code
+    for row in range(4):
+        four = _shuffle(builder, args[3], args[3], list(range(4 * row, 4 * row + 4)))
+        builder.store(four, _pointer(context, builder, sig, args, four.type, row)).align = 4
+    return context.get_dummy_value()
 
 
-@intrinsic
-def store_block3(typing: Any, array: Any, index: Any, stride: Any, x: Any, y: Any, z: Any) -> Any:
+@_intrinsic(lambda _, array, index, stride, x, y, z: types.void(array, types.int64, types.int64, vec16, vec16, vec16))
+def store_block3(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """A block's 4 rows of 4 triples (x, y, z) to array[index + row · stride : … + 12]."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        for row in range(4):
-            lanes = range(4 * row, 4 * row + 4)
-            pairs = _shuffle(builder, args[3], args[4], [v for k in lanes for v in (k, k + LANES)] + [0] * 8)
-            chosen = [v for n, k in enumerate(lanes) for v in (2 * n, 2 * n + 1, k + LANES)]
-            triples = _shuffle(builder, pairs, args[5], chosen)
-            builder.store(triples, _pointer(context, builder, sig, args, triples.type, row)).align = 4
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64, vec16, vec16, vec16), code
+    for row in range(4):
+        lanes = range(4 * row, 4 * row + 4)
+        pairs = _shuffle(builder, args[3], args[4], [v for k in lanes for v in (k, k + LANES)] + [0] * 8)
+        chosen = [v for n, k in enumerate(lanes) for v in (2 * n, 2 * n + 1, k + LANES)]
+        triples = _shuffle(builder, pairs, args[5], chosen)
+        builder.store(triples, _pointer(context, builder, sig, args, triples.type, row)).align = 4
+    return context.get_dummy_value()
 
 
 def _block_loader(channels: int, channel: int) -> Any:
-    def typer(typing: Any, array: Any, index: Any, stride: Any) -> Any:
-        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            kind = ir.VectorType(ir.FloatType(), 4 * channels)
-            rows = []
-            for row in range(4):
-                loaded = builder.load(_pointer(context, builder, sig, args, kind, row))
-                loaded.align = 4
-                rows.append(_shuffle(builder, loaded, loaded, list(range(channel, 4 * channels, channels))))
-            top, bottom = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
-            return _shuffle(builder, top, bottom, list(range(LANES)))
+    @_intrinsic(lambda _, array, index, stride: vec16(array, types.int64, types.int64))
+    def load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind, rows = ir.VectorType(ir.FloatType(), 4 * channels), []
+        for row in range(4):
+            loaded = builder.load(_pointer(context, builder, sig, args, kind, row))
+            loaded.align = 4
+            rows.append(_shuffle(builder, loaded, loaded, list(range(channel, 4 * channels, channels))))
+        top, bottom = (_shuffle(builder, rows[k], rows[k + 1], list(range(8))) for k in (0, 2))
+        return _shuffle(builder, top, bottom, list(range(LANES)))
 
-        return vec16(array, types.int64, types.int64), code
-
-    return intrinsic(typer)
+    return load
 
 
 # A block's 4 rows from array[index + row · stride : …]: 4 values each, or one channel of 4 triples.
@@ -175,57 +177,43 @@ def load_block3(array, index, stride):
     return _load_x(array, index, stride), _load_y(array, index, stride), _load_z(array, index, stride)
 
 
-@intrinsic
-def load1(typing: Any, array: Any, index: Any) -> Any:
+@_intrinsic(lambda _, array, index: array.dtype(array, types.int64))
+def load1(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """array[index] without the wrap-around of negative indices, which would block vectorisation."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, sig, args))
-
-    return array.dtype(array, types.int64), code
+    return builder.load(_pointer(context, builder, sig, args))
 
 
-@intrinsic
-def store1(typing: Any, array: Any, index: Any, value: Any) -> Any:
+@_intrinsic(lambda _, array, index, value: types.void(array, types.int64, array.dtype))
+def store1(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """array[index] = value without the wrap-around of negative indices."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _pointer(context, builder, sig, args))
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, array.dtype), code
+    builder.store(args[2], _pointer(context, builder, sig, args))
+    return context.get_dummy_value()
 
 
-@intrinsic
-def bits_of(typing: Any, x: Any) -> Any:
+@_intrinsic(lambda _, x: types.int64(types.float64))
+def bits_of(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """The bits of a float64."""
-    return types.int64(types.float64), lambda context, builder, sig, args: builder.bitcast(args[0], I64)
+    return builder.bitcast(args[0], I64)
 
 
-@intrinsic
-def float_of(typing: Any, bits: Any) -> Any:
+@_intrinsic(lambda _, bits: types.float64(types.int64))
+def float_of(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """The float64 with these bits."""
-    return types.float64(types.int64), lambda context, builder, sig, args: builder.bitcast(args[0], ir.DoubleType())
+    return builder.bitcast(args[0], ir.DoubleType())
 
 
-def _per_lane(count: int, build: Callable[..., Any]) -> Any:
-    """A function of `count` vectors, or scalars that go to every lane, to the vector that `build` makes of them."""
+def _per_lane(build: Callable[..., Any]) -> Any:
+    """A function of vectors, or scalars that go to every lane, to the vector that `build` makes of them."""
 
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return build(builder, *_vectors(builder, sig, args))
+    @wraps(build)
+    def typer(typing: Any, *given: Any) -> Any:
+        return vec16(*given), lambda context, builder, sig, args: build(builder, *_vectors(builder, sig, args))
 
-    typers: tuple[Callable[..., Any], ...] = (
-        lambda typing: (vec16(), code),
-        lambda typing, a: (vec16(a), code),
-        lambda typing, a, b: (vec16(a, b), code),
-        lambda typing, a, b, c: (vec16(a, b, c), code),
-        lambda typing, a, b, c, d: (vec16(a, b, c, d), code),
-    )
-    return intrinsic(typers[count])
+    return intrinsic(typer)
 
 
 def _lanes(number: Callable[[int], int]) -> Any:
-    return _per_lane(0, lambda builder: ir.Constant(VECTOR, [float(number(k)) for k in range(LANES)]))
+    return _per_lane(lambda builder: ir.Constant(VECTOR, [float(number(k)) for k in range(LANES)]))
 
 
 def _selected(comparison: str) -> Callable[..., Any]:
@@ -250,51 +238,39 @@ def _exp2(builder: Any, x: Any) -> Any:
 
 ramp16 = _lanes(lambda k: k)  # 0, 1, … 15
 columns16, rows16 = _lanes(lambda k: k % 4), _lanes(lambda k: k // 4)  # each lane's in a block of 4×4 pixels
-splat16 = _per_lane(1, lambda builder, x: x)
-sqrt16 = _per_lane(1, lambda builder, x: _call(builder, "sqrt", x))
-floor16 = _per_lane(1, lambda builder, x: _call(builder, "floor", x))
-exp2_16 = _per_lane(1, _exp2)  # 2^x for x ≤ 0; below −120 it is 2^−120
-max16 = _per_lane(2, _larger)  # y where x is NaN, as with the smaller
-min16 = _per_lane(2, lambda builder, x, y: _selected("<")(builder, x, y, x, y))
-fma16 = _per_lane(3, lambda builder, *abc: _call(builder, "fmuladd", *abc))  # a · b + c, in one rounding if possible
-where_greater, where_equal = _per_lane(4, _selected(">")), _per_lane(4, _selected("=="))  # (x, y, yes, no)
+splat16 = _per_lane(lambda builder, x: x)
+sqrt16 = _per_lane(lambda builder, x: _call(builder, "sqrt", x))
+floor16 = _per_lane(lambda builder, x: _call(builder, "floor", x))
+exp2_16 = _per_lane(_exp2)  # 2^x for x ≤ 0; below −120 it is 2^−120
+max16 = _per_lane(_larger)  # y where x is NaN, as with the smaller
+min16 = _per_lane(lambda builder, x, y: _selected("<")(builder, x, y, x, y))
+fma16 = _per_lane(lambda builder, a, b, c: _call(builder, "fmuladd", a, b, c))  # a · b + c, in one rounding if possible
+where_greater, where_equal = _per_lane(_selected(">")), _per_lane(_selected("=="))  # (x, y, yes, no)
 
 
-@intrinsic
-def any_between(typing: Any, x: Any, low: Any, high: Any) -> Any:
+@_intrinsic(lambda _, x, low, high: types.boolean(vec16, f32, f32))
+def any_between(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Whether low < x < high in any lane."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value, low, high = _vectors(builder, sig, args)
-        inside = builder.and_(builder.fcmp_ordered(">", value, low), builder.fcmp_ordered("<", value, high))
-        return builder.icmp_unsigned("!=", builder.bitcast(inside, I16), I16(0))
-
-    return types.boolean(vec16, f32, f32), code
+    value, low, high = _vectors(builder, sig, args)
+    inside = builder.and_(builder.fcmp_ordered(">", value, low), builder.fcmp_ordered("<", value, high))
+    return builder.icmp_unsigned("!=", builder.bitcast(inside, I16), I16(0))
 
 
-@intrinsic
-def spans_to_bits(typing: Any, first: Any, end: Any) -> Any:
+@_intrinsic(lambda _, first, end: types.uint64(vec16, vec16))
+def spans_to_bits(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """A 64-bit mask: in byte k the bits first_k … end_k − 1, for lanes 0–7 of integers within 0 … 8."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        low, high = (builder.shl(_integers(1), builder.fptosi(v, INTEGERS)) for v in args)
-        span = builder.select(builder.icmp_signed(">", high, low), builder.sub(high, low), _integers(0))
-        low_half = _shuffle(builder, span, span, list(range(8)))
-        return builder.bitcast(builder.trunc(low_half, ir.VectorType(ir.IntType(8), 8)), I64)
-
-    return types.uint64(vec16, vec16), code
+    low, high = (builder.shl(_integers(1), builder.fptosi(v, INTEGERS)) for v in args)
+    span = builder.select(builder.icmp_signed(">", high, low), builder.sub(high, low), _integers(0))
+    low_half = _shuffle(builder, span, span, list(range(8)))
+    return builder.bitcast(builder.trunc(low_half, ir.VectorType(ir.IntType(8), 8)), I64)
 
 
-@intrinsic
-def lowest_bit(typing: Any, bits: Any) -> Any:
+@_intrinsic(lambda _, bits: types.int64(types.uint64))
+def lowest_bit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Index of the lowest set bit of a mask that is not 0."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind = ir.FunctionType(I64, [I64, ir.IntType(1)])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.cttz.i64")
-        return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
-
-    return types.int64(types.uint64), code
+    kind = ir.FunctionType(I64, [I64, ir.IntType(1)])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.cttz.i64")
+    return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
 
 
 @inline_kernel
@@ -304,7 +280,8 @@ def next_bit(mask):
 
 
 def _reduction(combine: Callable[..., Any]) -> Any:
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    @_intrinsic(lambda _, x: f32(vec16))
+    def reduced(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value, lanes = args[0], LANES
         while lanes > 1:  # halves, so that the order of additions is fixed
             lanes //= 2
@@ -312,43 +289,74 @@ def _reduction(combine: Callable[..., Any]) -> Any:
             value = combine(builder, low, high)
         return builder.extract_element(value, I32(0))
 
-    return intrinsic(lambda typing, x: (f32(vec16), code))
+    return reduced
 
 
 # The sum of the lanes, always in the same order, and the largest lane
 sum16, highest16 = _reduction(lambda builder, low, high: builder.fadd(low, high)), _reduction(_larger)
 
 
-@intrinsic
-def sums16(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any,
-           i: Any, j: Any, k: Any, l: Any, m: Any, n: Any, o: Any, p: Any) -> Any:  # fmt: skip
+@_intrinsic(lambda _, a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p: vec16(*[vec16] * LANES))
+def sums16(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Lane k is the sum of the lanes of the k-th vector: 16 sums for the work of three."""
-
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        vectors, width = list(args), LANES
-        while len(vectors) > 1:  # every group of `width` lanes is added to half its width, two vectors to one
-            width //= 2
-            low = [k for k in range(2 * LANES) if k // width % 2 == 0]
-            high = [k + width for k in low]
-            vectors = [
-                builder.fadd(_shuffle(builder, x, y, low), _shuffle(builder, x, y, high))
-                for x, y in zip(vectors[::2], vectors[1::2])
-            ]
-        return vectors[0]
-
-    return vec16(*[vec16] * LANES), code
+    vectors, width = list(args), LANES
+    while len(vectors) > 1:  # every group of `width` lanes is added to half its width, two vectors to one
+        width //= 2
+        low = [k for k in range(2 * LANES) if k // width % 2 == 0]
+        high = [k + width for k in low]
+        vectors = [
+            builder.fadd(_shuffle(builder, x, y, low), _shuffle(builder, x, y, high))
+            for x, y in zip(vectors[::2], vectors[1::2])
+        ]
+    return vectors[0]
 
 
-@intrinsic
-def prefetch(typing: Any, array: Any, index: Any) -> Any:
+@_intrinsic(lambda _, array, index: types.void(array, types.int64))
+def prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Ask the memory for the cache line of array[index]: the blend loop jumps between feature rows."""
+    byte = ir.IntType(8).as_pointer()
+    pointer = _pointer(context, builder, sig, args, ir.IntType(8))
+    kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
+    function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+    builder.call(function, [pointer, I32(0), I32(3), I32(1)])
+    return context.get_dummy_value()
 
-    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        byte = ir.IntType(8).as_pointer()
-        pointer = _pointer(context, builder, sig, args, ir.IntType(8))
-        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, I32(0), I32(3), I32(1)])
-        return context.get_dummy_value()
 
-    return types.void(array, types.int64), code
+@inline_kernel
+def exp64(x):
+    """e^x with a relative error of 1e-11 for |x| ≤ 700; it is clamped beyond. For exact kernels only: fast-math
+    would cancel ROUNDING64."""
+    x = min(max(x, -700.0), 700.0)
+    shifted = x * LOG2E + ROUNDING64
+    r = x - (shifted - ROUNDING64) * LN2
+    p = 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    return float_of(bits_of(p) + (bits_of(shifted) << int64(52)))
+
+
+@inline_kernel
+def log2_64(y):
+    """log₂ y of a normal number with an absolute error of 1e-11."""
+    bits = bits_of(y)
+    # the exponent is counted from √½, so that the mantissa lies in [√½, √2)
+    lifted = bits - np.int64(0x3FE6A09E667F3BCD)
+    exponent = float_of(INTEGER_BITS | ((lifted >> int64(52)) + int64(2048))) - (INTEGER_OFFSET + 2048.0)
+    m = float_of((lifted & MANTISSA_BITS) + np.int64(0x3FE6A09E667F3BCD))
+    s = (m - 1.0) / (m + 1.0)
+    ss = s * s
+    p = 1.0 / 13.0
+    p = p * ss + 1.0 / 11.0
+    p = p * ss + 1.0 / 9.0
+    p = p * ss + 1.0 / 7.0
+    p = p * ss + 1.0 / 5.0
+    p = p * ss + 1.0 / 3.0
+    p = p * ss + 1.0
+    return exponent + 2.0 * LOG2E * s * p

@@ -44,15 +44,12 @@ def set_thread_count(count: int | None) -> None:
             _pool = None
 
 
-def _mark() -> None:
-    _inside.pool_thread = True
-
-
 def _executor() -> ThreadPoolExecutor:
     global _pool
     with _lock:
         if _pool is None:
-            _pool = ThreadPoolExecutor(_count or available_cores(), thread_name_prefix="gimp3d", initializer=_mark)
+            count, mark = _count or available_cores(), (_inside, "pool_thread", True)
+            _pool = ThreadPoolExecutor(count, thread_name_prefix="gimp3d", initializer=setattr, initargs=mark)
         return _pool
 
 

@@ -86,19 +86,6 @@ def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
     return u, v, den, free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
 
 
-@exact_kernel
-def region_blocks(pixels, blocks):
-    """The blocks of each tile that have a wanted pixel: pixels [H, W] uint8, blocks [down, across] uint64 out."""
-    height, width = pixels.shape
-    for t in range(blocks.size):
-        mask, top, left = uint64(0), t // blocks.shape[1] * TILE, t % blocks.shape[1] * TILE
-        for v in range(top, min(top + TILE, height)):
-            for u in range(left, min(left + TILE, width)):
-                if pixels[v, u]:
-                    mask |= uint64(1) << uint64(8 * ((v - top) // BLOCK) + (u - left) // BLOCK)
-        blocks[t // blocks.shape[1], t % blocks.shape[1]] = mask
-
-
 @inline_kernel
 def _cover(entries, i, stop, end, flat, row_size, left, top, covers):
     """The masks of entries i … stop−1. All at once, because each takes long to come out, and the loop over a mask's

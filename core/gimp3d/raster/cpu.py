@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from ..gaussians import ARRAYS, Gaussians
 from ..geometry import bounds
 from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
-from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, region_blocks, weigh_range
+from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
 from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, Projected, project_range
 from .types import PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 from .unblend import RECORD, unblend_range
@@ -27,7 +26,6 @@ Flags = tuple[bool, ...]  # blend_range's
 NO_STATES = np.empty((0, TILE_STATE), np.float32)
 NO_MASKS = np.empty(0, np.uint64)
 NO_PICTURES = (np.empty(0, np.float32),) * 5
-CHANNELS = (3, 1, 1, 1, 3)  # of rgb, alpha, expected depth, median depth, normals
 
 
 def project(
@@ -72,13 +70,9 @@ def tile_grid(camera: Camera) -> tuple[int, int]:
 def pack_camera(camera: Camera) -> np.ndarray:
     """What project_range reads of a camera, [22] float64; the Jacobian's bounds are gsplat's."""
     margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * camera.width, 0.5 * FRUSTUM_MARGIN * camera.height
-    slopes = [
-        (-camera.cx - margin_x) / camera.fx,
-        (camera.width - camera.cx + margin_x) / camera.fx,
-        (-camera.cy - margin_y) / camera.fy,
-        (camera.height - camera.cy + margin_y) / camera.fy,
-    ]
-    return np.append(pack_pinhole(camera), slopes)
+    across = (-camera.cx - margin_x) / camera.fx, (camera.width - camera.cx + margin_x) / camera.fx
+    down = (-camera.cy - margin_y) / camera.fy, (camera.height - camera.cy + margin_y) / camera.fy
+    return np.concatenate([pack_pinhole(camera), across, down])
 
 
 def pass_flags(passes: frozenset[str]) -> Flags:
@@ -113,24 +107,21 @@ def padded(picture: np.ndarray, camera: Camera) -> np.ndarray:
 def wanted_tiles(camera: Camera, pixels: Mask) -> tuple[np.ndarray, np.ndarray]:
     """Slots [down, across] int32 of the tiles, and blocks [S] uint64 of each slot, with wanted pixels [H, W] bool."""
     if pixels is None:
-        return _all_tiles(camera.height, camera.width)
+        pixels = np.ones((camera.height, camera.width), bool)
     if pixels.shape != (camera.height, camera.width):
         raise ValueError(f"pixels: expected shape {(camera.height, camera.width)}, got {pixels.shape}")
     blocks = wanted_blocks(pixels)
     return slots_of(blocks > 0), blocks[blocks > 0]
 
 
-@lru_cache(maxsize=16)
-def _all_tiles(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    blocks = wanted_blocks(np.ones((height, width), bool))
-    return slots_of(blocks > 0), blocks.ravel()
-
-
 def wanted_blocks(pixels: np.ndarray) -> np.ndarray:
     """The blocks of each tile, [down, across] uint64, that hold a pixel [H, W] which is not 0."""
-    blocks = np.empty([-(-side // TILE) for side in pixels.shape], np.uint64)
-    region_blocks(np.require(pixels, bool, ["C", "W"]).view(np.uint8), blocks)
-    return blocks
+    down, across = (-(-side // TILE) for side in pixels.shape)
+    whole = np.zeros((TILE * down, TILE * across), bool)
+    whole[: pixels.shape[0], : pixels.shape[1]] = pixels
+    blocks = whole.view(np.uint32).reshape(8 * down, BLOCK, 8 * across).any(1)  # 4 pixels of a row at a time
+    masks = np.packbits(blocks.reshape(down, 8, across, 8).swapaxes(1, 2), axis=-1, bitorder="little")
+    return masks.reshape(down, 8 * across).view(np.uint64)
 
 
 def slots_of(wanted: np.ndarray) -> np.ndarray:
@@ -218,15 +209,13 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
         np.empty(slots, np.int64),
         np.empty((slots if keep else 0, TILE_STATE), np.float32),
     )
-    (height, width), flags = padded_size(traced.camera), traced.flags
-    wanted = (flags[0], True, flags[1], flags[2], flags[3])
-    pictures = tuple(np.zeros(height * width * c if w else 0, np.float32) for w, c in zip(wanted, CHANNELS))
-    over_tiles(blend_range, traced.lists, traced.camera, traced.given(), kept, flags, front, pictures)
-    shapes = [(height, width, c) if w else (0, 0, c) for w, c in zip(wanted, CHANNELS)]
-    cut = [p.reshape(shape)[: traced.camera.height, : traced.camera.width] for p, shape in zip(pictures, shapes)]
-    cut = [np.ascontiguousarray(p if p.shape[2] == 3 else p[..., 0]) for p in cut]
-    rgb, alpha, expected, median, normals = cut
-    return Rendering(rgb, alpha, expected, median, normals, traced.view.ignored), replace(traced, kept=kept)
+    camera, flags = traced.camera, traced.flags
+    sides = [padded_size(camera) if wanted else (0, 0) for wanted in (flags[0], True, *flags[1:4])]
+    pictures = [np.zeros(size, np.float32) for size in ((*sides[0], 3), *sides[1:4], (*sides[4], 3))]
+    flat = tuple(p.reshape(-1) for p in pictures)
+    over_tiles(blend_range, traced.lists, camera, traced.given(), kept, flags, front, flat)
+    cut = [np.ascontiguousarray(p[: camera.height, : camera.width]) for p in pictures]
+    return Rendering(*cut, traced.view.ignored), replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import float32, float64, int32, int64
 
-from ..compute.exp_log import LOG2E, exp64, log2_64
+from ..compute.simd import LOG2E, exp64, log2_64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import load1, store1
 from .harmonics import BASIS_PLANES, sh_basis

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import float32, float64
 
-from ..compute.exp_log import exp64
+from ..compute.simd import exp64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import load1, load16, prefetch, splat16, store1, store16
 from .harmonics import BASIS_PLANES, C1, C2, C3, FOUR, SH_X, THREE, TWO, sh_basis
