@@ -16,8 +16,7 @@ from scipy.ndimage import gaussian_filter
 from gimp3d.box import Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
-from gimp3d.raster import Drawing, Rendering, use_backend
-from gimp3d.raster.backend import Backend, current_backend
+from gimp3d.raster import Backend, Drawing, Rendering, current_backend, use_backend
 from gimp3d.run import Observer
 from gimp3d.stages.depth import DepthCompletion
 
@@ -61,11 +60,6 @@ class NoisyDepths:
     def __init__(self, backend: Backend, relative: float, seed: int) -> None:
         self.backend, self.relative, self.seed = backend, relative, seed
 
-    def render(self, gaussians: Gaussians, camera: Camera, *options: Any) -> Rendering:
-        drawn = self.backend.render(gaussians, camera, *options)
-        depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
-        return replace(drawn, **{name: z * self._factor(camera) for name, z in depths.items() if z.size})
-
     def drawing(self, gaussians: Gaussians, camera: Camera, *options: Any) -> NoisyDrawing:
         return NoisyDrawing(self.backend.drawing(gaussians, camera, *options), self._factor(camera))
 
@@ -78,10 +72,15 @@ class NoisyDepths:
 
 @dataclass
 class NoisyDrawing:
-    """A `Drawing` whose surface is off by a factor [H, W]."""
+    """A `Drawing` whose depths are off by a factor [H, W]."""
 
     drawing: Drawing
     factor: np.ndarray
+
+    def render(self, *options: Any) -> Rendering:
+        drawn = self.drawing.render(*options)
+        depths = {"median_depth": drawn.median_depth, "expected_depth": drawn.expected_depth}
+        return replace(drawn, **{name: z * self.factor for name, z in depths.items() if z.size})
 
     def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         depth, alpha = self.drawing.surface_depth(gone)

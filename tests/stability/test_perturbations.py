@@ -8,8 +8,7 @@ from scenes import REGION, cameras, scene
 
 from benchmarks.perturbations import depth_errors, moved, noisy_depths, resized, turned
 from gimp3d.box import Box
-from gimp3d.raster import render, surface_depth
-from gimp3d.raster.backend import current_backend
+from gimp3d.raster import current_backend, render, surface_depth
 
 
 @pytest.mark.parametrize("pixels", [0.0, 0.1, 2.0, 10.0])

@@ -4,6 +4,9 @@ Conventions as in Inria's and gsplat's rasterisers: the projected covariance get
 is nothing and above 0.99 is 0.99, colours are max(0, 0.5 + SH), pixel centres lie at +0.5. Unlike there, a pixel is
 looked at every 16 Gaussians, not at each, to see whether it takes more: the difference is below `RasterSettings.stop`.
 Surfels are met by each pixel's ray (Huang 2024). The result is bit-equal for any number of threads.
+
+A mask of `pixels`, [H, W] bool, says which are wanted. All functions that take a mask raise a ValueError if it has not
+the picture's shape, and those that take passes if one is unknown.
 """
 
 from __future__ import annotations
@@ -12,11 +15,38 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import Gaussians
-from .backend import Backend as Backend
-from .backend import Drawing, PixelRegion, Trace, current_backend
-from .backend import use_backend as use_backend
+from . import cpu
+from .cpu import Trace
+from .cpu_drawing import Drawing
+from .region import PixelRegion, RegionTrace
 from .types import ALL_PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
 from .types import PASSES as PASSES
+
+
+class Backend:
+    """What draws: the cores of this machine. Whatever is to draw in its place has the same functions, and classes as
+    these; the functions of this package say what each means. Arrays are NumPy's, in and out."""
+
+    drawing = Drawing
+    pixel_region = PixelRegion
+    trace = staticmethod(cpu.trace)
+    contributions = staticmethod(cpu.contributions)
+    label_weights = staticmethod(cpu.label_weights)
+    touched_window = staticmethod(cpu.touched_window)
+
+
+_current = Backend()
+
+
+def current_backend() -> Backend:
+    return _current
+
+
+def use_backend(backend: Backend) -> Backend:
+    """Let `backend` draw from now on; returns the one that did so far."""
+    global _current
+    before, _current = _current, backend
+    return before
 
 
 def render(
@@ -28,21 +58,7 @@ def render(
 ) -> Rendering:
     """Draw a scene (paper, equations 1 and 2).
 
-    Parameters
-    ----------
-    passes
-        Any of rgb, alpha, depth (both depths), expected_depth and normal; only these are computed.
-
-    Returns
-    -------
-    Rendering
-        rgb [H, W, 3] in 0 … 1, alpha [H, W], expected_depth and median_depth [H, W] in scene units (0: nothing),
-        normals [H, W, 3] in the camera's frame; all float32, None where not asked for.
-
-    Raises
-    ------
-    ValueError
-        If a pass is unknown, or the mask has not the picture's shape.
+    Of the passes rgb, alpha, depth (both depths), expected_depth and normal only those given are computed.
 
     Examples
     --------
@@ -50,7 +66,7 @@ def render(
     >>> picture.rgb.shape, float(picture.alpha.max()) > 0.9
     ((45, 60, 3), True)
     """
-    return current_backend().render(gaussians, camera, settings, passes, pixels)
+    return drawing(gaussians, camera, settings, "rgb" in passes, pixels).render(passes)
 
 
 def render_bytes(
@@ -69,11 +85,6 @@ def trace(
 ) -> tuple[Rendering, Trace]:
     """As `render`, and what `backward` needs. The Gaussians' arrays must not change until then.
 
-    Raises
-    ------
-    ValueError
-        If a pass is unknown.
-
     Examples
     --------
     >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
@@ -84,18 +95,10 @@ def trace(
     return current_backend().trace(gaussians, camera, settings, passes)
 
 
-def backward(traced: Trace, gradients: PictureGradients) -> Gradients:
+def backward(traced: Trace | RegionTrace, gradients: PictureGradients) -> Gradients:
     """The gradient of a loss with respect to the traced Gaussians, given that with respect to their pictures.
 
-    Returns
-    -------
-    Gradients
-        Of means, log_scales, quats, opacity_logits and sh, each of its array's shape, float32.
-
-    Raises
-    ------
-    ValueError
-        If a gradient has not its picture's shape, or the picture was not rendered.
+    A ValueError if a gradient has not its picture's shape, or the picture was not rendered.
 
     Examples
     --------
@@ -121,11 +124,6 @@ def pixel_region(
     the depths they were at. That is not done with the pass `depth` (the median needs every Gaussian); ask for
     `expected_depth` alone where speed counts. A region is not for two threads at once.
 
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape, or a pass is unknown.
-
     Examples
     --------
     >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
@@ -150,11 +148,6 @@ def drawing(
     Pixels are those of the whole picture, bit by bit, however few are wanted. The Gaussians' arrays must not change
     while a drawing is in use, and it is not for two threads at once.
 
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
-
     Examples
     --------
     >>> scene, camera = read_ply("scene.ply").gaussians, read_cameras("transforms.json")[0]
@@ -173,12 +166,9 @@ def footprint(
     settings: RasterSettings = RasterSettings(),
     pixels: Mask = None,
 ) -> np.ndarray:
-    """Accumulated blend weight of the chosen Gaussians, [H, W] float32 in 0 … 1; others may hide them.
+    """Accumulated blend weight of the chosen Gaussians [N] bool, [H, W] float32 in 0 … 1; others may hide them.
 
-    Raises
-    ------
-    ValueError
-        If `chosen` or the mask has the wrong shape.
+    A ValueError if `chosen` has the wrong shape.
 
     Examples
     --------
@@ -193,21 +183,10 @@ def footprint(
 def surface_depth(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings = RasterSettings(), pixels: Mask = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha.
+    """z where each pixel's ray meets the Gaussian that blocks half of the light, and alpha, [H, W] float32 both.
 
     `Rendering.median_depth` is the z of that Gaussian's centre (but for surfels); this follows the slant of large
-    splats (Yu 2024; Zhang 2024).
-
-    Returns
-    -------
-    depth : ndarray, [H, W] float32
-        Scene units; 0 where alpha < 0.5.
-    alpha : ndarray, [H, W] float32
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
+    splats (Yu 2024; Zhang 2024). In scene units; 0 where alpha < 0.5.
 
     Examples
     --------
@@ -222,16 +201,6 @@ def contributions(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings = RasterSettings(), pixels: Mask = None
 ) -> Contributions:
     """Sum and maximum of every Gaussian's blend weights over the pixels of a view.
-
-    Returns
-    -------
-    Contributions
-        total [N] float32, the sum, and peak [N] float32, the maximum.
-
-    Raises
-    ------
-    ValueError
-        If the mask has not the picture's shape.
 
     Examples
     --------

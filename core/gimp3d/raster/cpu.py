@@ -215,7 +215,8 @@ def blend(traced: Trace, keep: bool, front: np.ndarray = NO_STATES) -> tuple[Ren
     flat = tuple(p.reshape(-1) for p in pictures)
     over_tiles(blend_range, traced.lists, camera, traced.given(), kept, flags, front, flat)
     cut = [np.ascontiguousarray(p[: camera.height, : camera.width]) for p in pictures]
-    return Rendering(*cut, traced.view.ignored), replace(traced, kept=kept)
+    rgb, alpha, expected, median, normals = cut
+    return Rendering(rgb, alpha, expected, median, normals, traced.view.ignored), replace(traced, kept=kept)
 
 
 def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camera, *args: Any) -> None:

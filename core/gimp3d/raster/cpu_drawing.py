@@ -30,8 +30,8 @@ NUMBERS_ONLY = (False, False, True, False, True)  # blend_range's flags
 REACH = 3.0  # standard deviations from its centre, along z, within which a Gaussian is met
 
 
-class CpuDrawing:
-    """See `Drawing`. Not for two threads at once."""
+class Drawing:
+    """A view of a scene, made ready once and drawn in several ways; see `drawing`."""
 
     def __init__(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, with_colour: bool, pixels: Mask
@@ -41,6 +41,7 @@ class CpuDrawing:
         self._made = cpu.prepare(gaussians, camera, settings, flags, pixels, with_records=False)
 
     def render(self, passes: frozenset[str], pixels: Mask = None) -> Rendering:
+        """As `render`; of the drawing's own pixels only those given."""
         flags = cpu.pass_flags(passes)
         if flags[0] and not self.with_colour:
             raise ValueError("this drawing has no colours")
@@ -50,6 +51,7 @@ class CpuDrawing:
         return self._draw(flags, wanted=self._made.wanted & there)
 
     def surface_depth(self, gone: Mask = None) -> tuple[np.ndarray, np.ndarray]:
+        """As `surface_depth`, without some Gaussians ([N] bool)."""
         lists = self._made.lists if gone is None else _without(self._made.lists, gone)
         shifts = cpu.depth_shifts(lists, self._made.features)
         if self.gaussians.is_surfels:
@@ -63,6 +65,7 @@ class CpuDrawing:
         return depth, drawn.alpha
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
+        """As `footprint`; only for drawings without colours."""
         if chosen.shape != (len(self.gaussians),):
             raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {chosen.shape}")
         if self.with_colour:

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import float32, float64, int32, int64
 
-from ..compute.simd import LOG2E, exp64, log2_64
 from ..compute.jit import exact_kernel, inline_kernel
-from ..compute.simd import load1, store1
+from ..compute.simd import LOG2E, exp64, load1, log2_64, store1
 from .harmonics import BASIS_PLANES, sh_basis
 from .staging import CHUNK, LOGIT, S0, S1, STAGED, X, Z, facing_normal, load3, rotation_of, stage, store3, to_camera
 

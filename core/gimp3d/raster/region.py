@@ -25,8 +25,8 @@ SLAB_MARGIN = 0.02  # of the depth: how far active Gaussians may move before lay
 WORTH_LAYERS = 0.5  # a tile gets layers if its slab holds fewer of its frozen entries than this
 
 
-class CpuPixelRegion:
-    """See `PixelRegion`. Not for two threads at once.
+class PixelRegion:
+    """A part of a view where some Gaussians change and the rest does not; see `pixel_region`.
 
     The layers need no median depth: with the pass `depth`, everything in the tiles is blended every time.
     """
@@ -54,9 +54,11 @@ class CpuPixelRegion:
         self._renderings = 0
 
     def render(self, active: Gaussians) -> Rendering:
+        """The region with the active Gaussians in it, as if they followed the frozen ones in one scene."""
         return self._draw(active, keep=False)[0]
 
     def trace(self, active: Gaussians) -> tuple[Rendering, RegionTrace]:
+        """As `render`, and the way back to the active Gaussians, open until the region is rendered again."""
         return self._draw(active, keep=True)
 
     def _draw(self, active: Gaussians, keep: bool) -> tuple[Rendering, RegionTrace]:
@@ -125,7 +127,7 @@ class CpuPixelRegion:
 class RegionTrace:
     """The way back from a rendering of a region."""
 
-    region: CpuPixelRegion
+    region: PixelRegion
     rendering: int  # which of the region's renderings
     traced: cpu.Trace
 

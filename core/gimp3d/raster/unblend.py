@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import float32, int64
 
-from ..compute.simd import LN2
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import (
+    LN2,
     columns16,
     fma16,
     load16,

@@ -10,9 +10,8 @@ import math
 import numpy as np
 from numba import float32, float64
 
-from ..compute.simd import exp64
 from ..compute.jit import exact_kernel, inline_kernel
-from ..compute.simd import load1, load16, prefetch, splat16, store1, store16
+from ..compute.simd import exp64, load1, load16, prefetch, splat16, store1, store16
 from .harmonics import BASIS_PLANES, C1, C2, C3, FOUR, SH_X, THREE, TWO, sh_basis
 from .project import BLUE, DRAWN, EDGE_ON, GREEN, HALF_LOG2E, RED, ZERO
 from .staging import CHUNK, LOGIT, QW, S0, S1, STAGED, X, facing_normal, load3, rotation_of, stage, store3, to_camera

@@ -153,10 +153,13 @@ class FakeTrace:
 
 @dataclass
 class FakeDrawing:
-    shape: tuple[int, int]
+    picture: Rendering
+
+    def render(self, passes: frozenset[str]) -> Rendering:
+        return self.picture
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
-        return np.full(self.shape, 8, np.float32)
+        return np.full_like(self.picture.alpha, 8)
 
 
 @dataclass
@@ -166,14 +169,7 @@ class FakeBackend:
     seen: list[Gaussians] = field(default_factory=list)
     traces: list[FakeTrace] = field(default_factory=list)
 
-    def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        settings: RasterSettings,
-        passes: frozenset[str],
-        pixels: np.ndarray | None = None,
-    ) -> Rendering:
+    def picture(self, gaussians: Gaussians, camera: Camera) -> Rendering:
         self.seen.append(gaussians)
         size = (camera.height, camera.width)
         shapes = ((*size, 3), size, size, (0, 0), (*size, 3))
@@ -183,11 +179,10 @@ class FakeBackend:
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, passes: frozenset[str]
     ) -> tuple[Rendering, FakeTrace]:
         self.traces.append(FakeTrace(gaussians))
-        return self.render(gaussians, camera, settings, passes), self.traces[-1]
+        return self.picture(gaussians, camera), self.traces[-1]
 
     def drawing(self, gaussians: Gaussians, camera: Camera, *_: object) -> FakeDrawing:
-        self.seen.append(gaussians)
-        return FakeDrawing((camera.height, camera.width))
+        return FakeDrawing(self.picture(gaussians, camera))
 
     def contributions(
         self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None

@@ -22,9 +22,7 @@ from gimp3d.io.images import load_view, read_mask
 from gimp3d.io.ply import read_ply
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
-from gimp3d.raster import render, surface_depth
-from gimp3d.raster.backend import CpuBackend
-from gimp3d.raster.cpu_drawing import CpuDrawing
+from gimp3d.raster import Backend, Drawing, render, surface_depth
 from gimp3d.stages import look, selection, targets
 from gimp3d.stages import masks as stage
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
@@ -179,12 +177,12 @@ def test_views_that_do_not_fit_fall_back_to_the_papers_targets(monkeypatch: pyte
     assert wrong.mode == "paper" and "do not match" in wrong.reason and "paper" in wrong.warnings[0]
     assert wrong.hole_pixels > 0.9 * paper.hole_pixels and paper.warnings == ()
 
-    class Noisy(CpuDrawing):
+    class Noisy(Drawing):
         def surface_depth(self, gone: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
             depth, alpha = super().surface_depth(gone)
             return (depth * rng.uniform(0.7, 1.3, depth.shape)).astype(np.float32), alpha
 
-    monkeypatch.setattr(CpuBackend, "drawing", staticmethod(Noisy))
+    monkeypatch.setattr(Backend, "drawing", Noisy)
     vague = find_masks(scene(), REGION, views)
     assert vague.mode == "paper" and "alike" in vague.warnings[0] and vague.hole_pixels > 0.9 * paper.hole_pixels
 
