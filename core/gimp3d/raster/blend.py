@@ -185,46 +185,34 @@ def blend_range(slots, lists, given, kept, flags, front, pictures):
             if surfels:
                 surfel = surfel_of(flat, o)
                 x, y = float32(left) + HALF - surfel[0], float32(top) + HALF - surfel[1]
-                while mask:
-                    b, mask = next_bit(mask)
-                    k = b * BLOCK_STATE
-                    dx, dy = column + (x + BLOCK_PX * float32(b & 7)), row + (y + BLOCK_PX * float32(b >> 3))
-                    _, _, _, _, alpha, inverse, blurred = surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits)
-                    before = load16(state, k + T)
-                    weight = alpha * before
-                    after = before - weight
-                    store16(state, k + T, after)
-                    if with_rgb:
-                        _add_three(state, k + R, weight, red, green, blue)
-                    if with_depth:
-                        z = where_greater(blurred, ZERO, splat16(depth), inverse * depth)
-                        store16(state, k + Z, fma16(weight, z - shift, load16(state, k + Z)))
-                    if with_median:
-                        _mark_median(state, k, before, after, number)
-                    if with_normals:
-                        _add_three(state, k + NX, weight, nx, ny, nz)
             else:
                 x, y, xx, xy, yy = ellipse_of(flat, o)
                 x, y = float32(left) + HALF - x, float32(top) + HALF - y
                 along0, down0 = fma16(column, xx, row * xy), row * yy
-                while mask:
-                    b, mask = next_bit(mask)
-                    k = b * BLOCK_STATE
-                    dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
+            while mask:
+                b, mask = next_bit(mask)
+                k = b * BLOCK_STATE
+                dx, dy = x + BLOCK_PX * float32(b & 7), y + BLOCK_PX * float32(b >> 3)
+                if surfels:
+                    hit = surfel_alpha(surfel, column + dx, row + dy, log2_opacity, depth, limits)
+                    alpha, z = hit[4], where_greater(hit[6], ZERO, splat16(depth), hit[5] * depth)
+                else:
                     along, down = along0 + (dx * xx + dy * xy), down0 + dy * yy
                     _, alpha = ellipse_alpha(along, down, log2_opacity, limits)
-                    before = load16(state, k + T)
-                    weight = alpha * before
-                    after = before - weight
-                    store16(state, k + T, after)
-                    if with_rgb:
-                        _add_three(state, k + R, weight, red, green, blue)
-                    if with_depth:
-                        store16(state, k + Z, fma16(weight, depth - shift, load16(state, k + Z)))
-                    if with_median:
-                        _mark_median(state, k, before, after, number)
-                    if with_normals:
-                        _add_three(state, k + NX, weight, nx, ny, nz)
+                    z = splat16(depth)
+                before = load16(state, k + T)
+                weight = alpha * before
+                after = before - weight
+                store16(state, k + T, after)
+                if with_rgb:
+                    _add_three(state, k + R, weight, red, green, blue)
+                if with_depth:
+                    store16(state, k + Z, fma16(weight, z - shift, load16(state, k + Z)))
+                if with_median:
+                    crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
+                    store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
+                if with_normals:
+                    _add_three(state, k + NX, weight, nx, ny, nz)
             i += 1
             if (i - first) % CHECK == 0:
                 alive, closing = _close(state, BLOCK_STATE, alive, float32(i - first), stop)
@@ -241,12 +229,6 @@ def _add_three(state, k, weight, a, b, c):
     store16(state, k, fma16(weight, a, load16(state, k)))
     store16(state, k + 16, fma16(weight, b, load16(state, k + 16)))
     store16(state, k + 32, fma16(weight, c, load16(state, k + 32)))
-
-
-@inline_kernel
-def _mark_median(state, k, before, after, number):
-    crossed = where_greater(after, HALF, load16(state, k + MEDIAN), number)
-    store16(state, k + MEDIAN, where_greater(before, HALF, crossed, load16(state, k + MEDIAN)))
 
 
 @inline_kernel
