@@ -6,37 +6,23 @@ depend on how the work is cut into chunks.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-from numba import float32, float64, int64, uint64
+from numba import float32, int64, uint64
 
 from ..compute.jit import exact_kernel, inline_kernel
-from ..compute.simd import (
-    floor16,
-    fma16,
-    load1,
-    max16,
-    min16,
-    next_bit,
-    prefetch,
-    ramp16,
-    spans_to_bits,
-    sqrt16,
-    where_greater,
-)
+from ..compute.simd import next_bit, prefetch
 from ..compute.threads import parallel_map, run_ranges, thread_count
-from .project import DEPTH, DRAWN, HALF, HALF_HEIGHT, HIDDEN, TILE, ZERO, Projected, ellipse_of
+from .blend import CELLS, cover_mask
+from .project import DEPTH, DRAWN, HIDDEN, TILE, Projected
 
 AHEAD = 16  # rows to prefetch: in depth order each is a cache miss
-CELLS = 8  # a mask has a bit for each of 8×8 cells
 MOST_DIGIT_BITS = 12  # of the radix sort: 4096 counters fit into a core's nearest cache
 ROWS_PER_CHUNK = 8192  # fewer Gaussians than this are not worth a thread
 FIRST_COLUMN = np.uint64(0x0101010101010101)  # of a mask of cells
-ONE, EIGHT, CELL = np.float32(1), np.float32(CELLS), np.float32(TILE)
-SLACK_PX, SLACK = np.float32(0.01), np.float32(5e-4)  # of the bound, for float32's rounding: at worst √(2·6e-8)
+CELL = np.float32(TILE)
 
 
 @dataclass(frozen=True)
@@ -100,86 +86,53 @@ def depth_order(features: np.ndarray, states: np.ndarray) -> np.ndarray:
     """
     chunks = _chunks(len(states))
     *starts, total = accumulate((int(np.count_nonzero(states[lo:hi] == DRAWN)) for lo, hi in chunks), initial=0)
-    rows, keys = np.empty((2, total), np.int32), np.empty((2, total), np.int32)
-    bits = features.view(np.int32)
-    parallel_map(lambda part: _gather_keys(*part[0], bits, states, part[1], rows[0], keys[0]), zip(chunks, starts))
-    if not total:
-        return rows[0]
-    lowest = int(keys[0].min())
-    length = (int(keys[0].max()) - lowest).bit_length()
-    passes = -(-length // MOST_DIGIT_BITS)
-    for p in range(passes):
-        a, b, width = p % 2, 1 - p % 2, -(-length // passes)
-        _sort_by_digit(keys[a], rows[a], lowest, p * width, width, keys[b], rows[b])
-    return rows[passes % 2]
+    items, bits = np.empty(total, np.int64), features.view(np.int32)
+    parallel_map(lambda part: _gather(*part[0], bits, states, part[1], items), zip(chunks, starts))
+    if total:
+        items -= items.min() >> 32 << 32
+        length = int(items.max() >> 32).bit_length()
+        passes = max(1, -(-length // MOST_DIGIT_BITS))
+        width = -(-length // passes)
+        for p in range(passes):
+            items = _sorted_by_digit(items, 32 + p * width, width)
+    return items.astype(np.int32)
 
 
-def _sort_by_digit(
-    keys: np.ndarray, rows: np.ndarray, lowest: int, shift: int, width: int, keys_out: np.ndarray, rows_out: np.ndarray
-) -> None:
-    """A stable counting sort by `width` bits of the keys, each chunk of them on its own thread."""
-    chunks = _chunks(len(keys))
+def _sorted_by_digit(items: np.ndarray, shift: int, width: int) -> np.ndarray:
+    """A stable counting sort by `width` bits of the items, each chunk of them on its own thread."""
+    chunks, result = _chunks(len(items)), np.empty_like(items)
     counts = np.zeros((len(chunks), 1 << width), np.int32)
-    parallel_map(lambda part: _count_digits(*part[0], keys, lowest, shift, part[1]), zip(chunks, counts))
+    parallel_map(lambda part: _count_digits(*part[0], items, shift, part[1]), zip(chunks, counts))
     ends = np.cumsum(counts.T, dtype=np.int32).reshape(counts.T.shape)
     places = np.ascontiguousarray(ends.T) - counts
-    out = keys_out, rows_out
-    parallel_map(lambda part: _scatter_digits(*part[0], keys, rows, lowest, shift, part[1], *out), zip(chunks, places))
+    parallel_map(lambda part: _scatter_digits(*part[0], items, shift, part[1], result), zip(chunks, places))
+    return result
 
 
 @exact_kernel
-def _gather_keys(lo, hi, feature_bits, states, place, rows, keys):
+def _gather(lo, hi, feature_bits, states, place, items):
+    """Of each drawn row its depth's bits above its number."""
     for i in range(lo, hi):
         if states[i] == DRAWN:
-            rows[place] = i
-            keys[place] = feature_bits[i, DEPTH]
+            items[place] = (int64(feature_bits[i, DEPTH]) << 32) | i
             place += 1
 
 
 @exact_kernel
-def _count_digits(lo, hi, keys, lowest, shift, counts):
+def _count_digits(lo, hi, items, shift, counts):
     last = len(counts) - 1
     for i in range(lo, hi):
-        counts[((keys[i] - lowest) >> shift) & last] += 1
+        counts[(items[i] >> shift) & last] += 1
 
 
 @exact_kernel
-def _scatter_digits(lo, hi, keys, rows, lowest, shift, places, keys_out, rows_out):
+def _scatter_digits(lo, hi, items, shift, places, result):
     last = len(places) - 1
     for i in range(lo, hi):
-        digit = ((keys[i] - lowest) >> shift) & last
+        digit = (items[i] >> shift) & last
         place = places[digit]
         places[digit] = place + 1
-        keys_out[place] = keys[i]
-        rows_out[place] = rows[i]
-
-
-@inline_kernel
-def cover_mask(flat, o, left, top, cell):
-    """Which of the 8×8 cells of `cell` px, from pixel (left, top) on, have a pixel centre in the bound of row o.
-
-    Bit 8 r + c stands for column c of row r. Lane r of the vectors is row r. Rounding may add a cell, never lose one.
-    """
-    x, y, xx, xy, yy = ellipse_of(flat, o)
-    half_height = load1(flat, o + HALF_HEIGHT)
-    radius, inverse = half_height * yy, ONE / xx
-    first_centre = fma16(ramp16(), cell, top + HALF - y)
-    low = max16(first_centre, -half_height)
-    high = min16(first_centre + (cell - ONE), half_height)
-    # the bound reaches furthest right at dy = tip and furthest left at dy = −tip
-    slope = float64(xy) / float64(yy)
-    tip = float32(-slope * float64(radius) / (float64(yy) * math.sqrt(1.0 + slope * slope)))
-    right, left_dy = min16(max16(tip, low), high), min16(max16(-tip, low), high)
-    down_right, down_left = right * yy, left_dy * yy
-    reach_right = sqrt16(max16(radius * radius - down_right * down_right, ZERO)) - right * xy + SLACK * radius
-    reach_left = sqrt16(max16(radius * radius - down_left * down_left, ZERO)) + left_dy * xy + SLACK * radius
-    middle, per_cell = x - left, ONE / cell
-    # pixel centres lie at +½: the first pixel right of v is −⌊½ − v⌋, the last one left of it ⌊v − ½⌋
-    first_pixel = ZERO - floor16(HALF + SLACK_PX - (middle - reach_left * inverse))
-    last_pixel = floor16(middle + reach_right * inverse - (HALF - SLACK_PX))
-    first = floor16(max16(min16(first_pixel * per_cell, EIGHT), ZERO))
-    end = floor16(max16(min16(last_pixel * per_cell, EIGHT - ONE), -ONE)) + ONE
-    return spans_to_bits(first, where_greater(low, high + SLACK_PX, ZERO, end))
+        result[place] = items[i]
 
 
 @exact_kernel

@@ -7,14 +7,17 @@ through which less than `stop` of the light passes are closed; blocks and tiles 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from numba import float32, int64, uint64
+from numba import float32, float64, int64, uint64
 
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import (
     any_between,
     columns16,
     exp2_16,
+    floor16,
     fma16,
     highest16,
     load1,
@@ -23,7 +26,9 @@ from ..compute.simd import (
     min16,
     next_bit,
     prefetch,
+    ramp16,
     rows16,
+    spans_to_bits,
     splat16,
     sqrt16,
     store16,
@@ -32,8 +37,7 @@ from ..compute.simd import (
     sum16,
     where_greater,
 )
-from .bin import ONE, cover_mask
-from .project import DEPTH, HALF, TILE, ZERO, ellipse_of, shown_of, surfel_of
+from .project import DEPTH, HALF, HALF_HEIGHT, TILE, ZERO, ellipse_of, shown_of, surfel_of
 
 BLOCK = 4  # px, side of a block
 BLOCKS = 64  # in a tile
@@ -41,7 +45,9 @@ CHECK = 16  # list entries between two looks at the transmittance; 0.99^16 of 1e
 NOTHING = np.float32(1e-6)  # weights and lengths below it are rounding
 HORIZON = np.float32(1e-6)  # 1 + A·δ of a surfel met a million times further away than its centre
 NEVER = np.float32(1e30)  # a squared length that no exponential survives
-BLOCK_PX, LAST_PX = np.float32(BLOCK), np.float32(BLOCK - 1)
+CELLS = 8  # a mask has a bit for each of 8×8 cells
+ONE, EIGHT, BLOCK_PX = np.float32(1), np.float32(CELLS), np.float32(BLOCK)
+SLACK_PX, SLACK = np.float32(0.01), np.float32(5e-4)  # of the bound, for float32's rounding: at worst √(2·6e-8)
 
 # Planes of a block's state. T is the transmittance of open pixels and 0 for closed ones, whose transmittance is kept
 # in HELD with the number of list entries after which they closed in CLOSED. MEDIAN is 1 + the list entry that took T
@@ -84,6 +90,34 @@ def surfel_alpha(surfel, dx, dy, log2_opacity, depth, limits):
     free = exp2_16(log2_opacity - min16(low_pass, squared))
     alpha = where_greater(free, alpha_min, min16(free, alpha_max), ZERO)
     return u, v, den, free, alpha, inverse, where_greater(squared, low_pass, splat16(ONE), ZERO)
+
+
+@inline_kernel
+def cover_mask(flat, o, left, top, cell):
+    """Which of the 8×8 cells of `cell` px, from pixel (left, top) on, have a pixel centre in the bound of row o.
+
+    Bit 8 r + c stands for column c of row r. Lane r of the vectors is row r. Rounding may add a cell, never lose one.
+    """
+    x, y, xx, xy, yy = ellipse_of(flat, o)
+    half_height = load1(flat, o + HALF_HEIGHT)
+    radius, inverse = half_height * yy, ONE / xx
+    first_centre = fma16(ramp16(), cell, top + HALF - y)
+    low = max16(first_centre, -half_height)
+    high = min16(first_centre + (cell - ONE), half_height)
+    # the bound reaches furthest right at dy = tip and furthest left at dy = −tip
+    slope = float64(xy) / float64(yy)
+    tip = float32(-slope * float64(radius) / (float64(yy) * math.sqrt(1.0 + slope * slope)))
+    right, left_dy = min16(max16(tip, low), high), min16(max16(-tip, low), high)
+    down_right, down_left = right * yy, left_dy * yy
+    reach_right = sqrt16(max16(radius * radius - down_right * down_right, ZERO)) - right * xy + SLACK * radius
+    reach_left = sqrt16(max16(radius * radius - down_left * down_left, ZERO)) + left_dy * xy + SLACK * radius
+    middle, per_cell = x - left, ONE / cell
+    # pixel centres lie at +½: the first pixel right of v is −⌊½ − v⌋, the last one left of it ⌊v − ½⌋
+    first_pixel = ZERO - floor16(HALF + SLACK_PX - (middle - reach_left * inverse))
+    last_pixel = floor16(middle + reach_right * inverse - (HALF - SLACK_PX))
+    first = floor16(max16(min16(first_pixel * per_cell, EIGHT), ZERO))
+    end = floor16(max16(min16(last_pixel * per_cell, EIGHT - ONE), -ONE)) + ONE
+    return spans_to_bits(first, where_greater(low, high + SLACK_PX, ZERO, end))
 
 
 @inline_kernel

@@ -29,7 +29,6 @@ from ..compute.simd import (
     where_equal,
     where_greater,
 )
-from .bin import ONE
 from .blend import (
     BLOCK,
     BLOCK_PX,
@@ -41,6 +40,7 @@ from .blend import (
     MEDIAN,
     NOTHING,
     NX,
+    ONE,
     R,
     T,
     Z,
