@@ -24,6 +24,7 @@ TYPES = {
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 CACHED_ROWS = 1 << 12
 MAX_HEADER = 1 << 20  # bytes; a longer header is not a PLY's
+Body = tuple[bytes, np.ndarray, bytes]  # before the vertices, their rows, and behind them
 ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip\b|\bantialiased\s+1\b", re.IGNORECASE)
 
 
@@ -220,9 +221,7 @@ def _row_bytes(path: Path, element: PlyElement) -> int:
     return sum(np.dtype(TYPES[p.type]).itemsize for p in element.properties)
 
 
-def _read_binary(
-    path: Path, elements: Sequence[PlyElement], vertex: int, start: int
-) -> tuple[bytes, np.ndarray, bytes]:
+def _read_binary(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> Body:
     first = start + sum(e.count * _row_bytes(path, e) for e in elements[:vertex])
     row_bytes, count, size = _row_bytes(path, elements[vertex]), elements[vertex].count, path.stat().st_size
     if first + count * row_bytes > size:
@@ -237,7 +236,7 @@ def _read_binary(
     return before, rows, after
 
 
-def _read_ascii(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> tuple[bytes, np.ndarray, bytes]:
+def _read_ascii(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> Body:
     lines = path.read_bytes()[start:].splitlines(keepends=True)
     first = sum(e.count for e in elements[:vertex])
     count = elements[vertex].count

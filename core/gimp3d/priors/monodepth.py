@@ -76,9 +76,7 @@ def depth_prior(
     values = look(image, height, width)
     if not np.isfinite(values).any():
         raise BadInput(f"{call.option}: {spec.partition(':')[2]} gives no finite value")
-    if values.shape != (height, width):
-        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
-    return DepthPrior(values.astype(np.float32), kind)
+    return DepthPrior(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32), kind)
 
 
 def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) -> None:
