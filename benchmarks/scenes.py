@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,7 +23,7 @@ from gimp3d.evaluate.metrics import psnr, score
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.formats import read_scene as read_splats
-from gimp3d.io.images import load_view, read_image, read_mask, undistorted, write_png
+from gimp3d.io.images import load_view, read_image, read_mask, write_png
 from gimp3d.pipeline import RemovalResult, RemovalSettings, View, remove_object, render_bytes
 from gimp3d.run import Observer, unobserved
 
@@ -123,7 +123,7 @@ def read_scene(folder: Path, needs_truth: bool = False) -> Scene:
     if not (folder / "scene.ply").is_file():
         raise BadInput(f"{folder} holds no scene.ply, transforms.json and roi.json")
     cameras = tuple(read_cameras(folder / "transforms.json"))
-    pinhole = tuple(undistorted(c) for c in cameras)
+    pinhole = tuple(replace(c, distortion=None) for c in cameras)
     test = select_cameras(pinhole, "test") if (folder / "truth").is_dir() else ()
     return Scene(folder, cameras, select_cameras(pinhole, "train"), test)
 

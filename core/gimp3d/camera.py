@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+LARGEST_SIDE, LARGEST_PICTURE = (1 << 16) - 1, 1 << 27  # pixels
+
 
 @dataclass(frozen=True)
 class Distortion:

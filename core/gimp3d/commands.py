@@ -24,7 +24,7 @@ from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
-from .io.images import load_view, read_image, undistorted, write_png
+from .io.images import load_view, read_image, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .job import MOST_VARIANTS, RemovalJob
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
@@ -165,7 +165,8 @@ def render_views(
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     raster = RasterSettings(background=tuple(background))  # type: ignore[arg-type]
     for done, camera in enumerate(chosen, 1):
-        drawn = render(gaussians, frame.camera(undistorted(camera).scaled(scale)), raster, frozenset(passes))
+        pinhole = replace(camera, distortion=None).scaled(scale)
+        drawn = render(gaussians, frame.camera(pinhole), raster, frozenset(passes))
         name = output_name(camera.id)
         if "rgb" in passes:
             write_png(out / f"{name}.png", to_bytes(drawn.rgb))
@@ -404,7 +405,7 @@ def _load_views(
         if wanted and camera.image is not None and camera.image.exists():
             image, pinhole = load_view(camera)
             return View(frame.camera(pinhole), image), False
-        pinhole = frame.camera(undistorted(camera))
+        pinhole = frame.camera(replace(camera, distortion=None))
         return View(pinhole, render_bytes(scene, pinhole), is_photo=False), wanted
 
     loaded = parallel_map(load, cameras)

@@ -1,5 +1,8 @@
 """Errors that end as one clear line. Each names the exit code of the command line."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class Gimp3dError(Exception):
     """Base of every error that a user can act on; the message says what, where, and what to do."""
@@ -31,3 +34,17 @@ class Cancelled(Gimp3dError):
     """The caller asked to stop."""
 
     exit_code = 130
+
+
+def one_line(text: object, most: int = 300) -> str:
+    """What somebody outside says, for an error's line."""
+    return " ".join(str(text).split())[:most]
+
+
+@contextmanager
+def refusing(what: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Errors of these kinds inside end as BadInput: `what` went wrong, with the reason in brackets."""
+    try:
+        yield
+    except kinds as error:
+        raise BadInput(f"{what} ({one_line(getattr(error, 'strerror', None) or error)})") from None

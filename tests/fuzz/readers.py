@@ -37,11 +37,11 @@ from gimp3d.errors import BadInput, Gimp3dError
 from gimp3d.io.cameras import camera_id, read_cameras
 from gimp3d.io.formats import _from_sog, read_scene
 from gimp3d.io.images import load_view, read_image
-from gimp3d.io.ply import _parse_header, write_gaussians
+from gimp3d.io.ply import header_of, write_gaussians
 from gimp3d.job import RemovalJob, load_job, save_job
 from gimp3d.priors import servers
 from gimp3d.priors.monodepth import _from_file
-from gimp3d.priors.onnx import read_model
+from gimp3d.priors.networks import read_onnx
 from gimp3d.priors.servers import _Automatic, _Comfy, _said, _Server, _workflow
 from gimp3d.schema import checked, parse_json
 from gimp3d.settings import job_settings
@@ -245,7 +245,7 @@ def read_answers(data: bytes) -> object:
 
 
 def read_depth(name: str) -> Callable[[bytes], object]:
-    return in_file(name, lambda path: _from_file(path, 6, 8))
+    return in_file(name, lambda path: _from_file(path, "depth", 6, 8))
 
 
 def depth_seeds() -> list[bytes]:
@@ -268,12 +268,12 @@ def scene_seed(name: str) -> Callable[[], list[bytes]]:
     return file_seeds(lambda p: WRITERS[name](p, some(20)), name)
 
 
-def header_of(data: bytes) -> object:
-    return _parse_header(Path("x.ply"), data.decode("latin-1").split("\n"))
+def read_header(data: bytes) -> object:
+    return in_file("h.ply", header_of)(b"ply\n" + data + b"\nend_header\n")
 
 
 def ply_header() -> list[bytes]:
-    return [file_seeds(lambda p: write_gaussians(p, some(2)), "h.ply")()[0].partition(b"end_header")[0]]
+    return [file_seeds(lambda p: write_gaussians(p, some(2)), "h.ply")()[0].partition(b"\nend_header")[0][4:]]
 
 
 def job_seed(path: Path) -> None:
@@ -288,13 +288,13 @@ READERS = {
         Reader("ids", lambda d: camera_id(d.decode("utf-8", "surrogatepass"), "x") if ok(d) else None,
                lambda: [b"images/a.png", "ä/ü".encode()], needs_files=False),
         Reader("settings", read_settings, dumped(SETTINGS), True, False),
-        Reader("ply header", header_of, ply_header, needs_files=False),
+        Reader("ply header", read_header, ply_header),
         Reader("sog description", read_sog, sog_descriptions, True, False),
         Reader("server", read_answers, dumped(COMFY, AUTOMATIC, REFUSED), True, False),
         Reader("workflow", in_file("w.json", lambda p: _workflow(p, "x")), dumped(WORKFLOW), True),
         Reader("depth npy", read_depth("d.npy"), depth_seeds),
         Reader("depth picture", read_depth("d.png"), picture(".png")),
-        Reader("onnx", in_file("m.onnx", lambda p: read_model("x", p)), onnx_seed),
+        Reader("onnx", in_file("m.onnx", lambda p: read_onnx("x", p)), onnx_seed),
         Reader("transforms", read_json_cameras, dumped(TRANSFORMS), True),
         Reader("inria", read_json_cameras, dumped(INRIA), True),
         Reader("colmap bin", read_colmap("bin"), colmap_seeds),

@@ -15,19 +15,17 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..camera import Camera, Distortion, output_name
-from ..errors import BadInput
+from ..camera import LARGEST_PICTURE, LARGEST_SIDE, Camera, Distortion, output_name
+from ..errors import BadInput, refusing
 from ..files import require_file, write_json
 from ..gaussians import quats_to_matrices
 from ..schema import Between, checked, read_json, shown
-from .picture_size import LARGEST_PICTURE, LARGEST_SIDE
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # the camera's own axes: y up, z backward → y down, z forward
 NARROWEST, WIDEST = 1e4, 1e-3  # focal lengths over the picture's width: views of a hundredth and of 179.9 degrees
 LONGEST_NAME = 200  # bytes of each part of an ID: file systems allow 255, and our own endings come behind it
 LONGEST_ID = 1000
 LensAngle = Annotated[float, Between(1e-4, math.pi - 1e-4)]  # radians
-EXACT = "world_to_camera"  # our own key of a frame; counts only where transform_matrix says the same
 REFUSED = {  # camera models that have no pinhole picture
     "fisheye": ".*FISHEYE|FOV",
     "panoramic": "EQUIRECTANGULAR|SPHERICAL|PANORAMIC|(VR180|OMNIDIRECTIONALSTEREO)_[LR]",
@@ -47,7 +45,9 @@ COLMAP_MODELS = {  # in the order of their numbers in cameras.bin; the parameter
     "RADIAL_FISHEYE": "? ? ? ? ?",
     "THIN_PRISM_FISHEYE": "? ? ? ? ? ? ? ? ? ? ? ?",
 }
-Lens = tuple[str, int, int, list[float]]  # COLMAP's model, width, height, parameters
+COLMAP_DAMAGE = (struct.error, ValueError, IndexError, KeyError, OverflowError)
+Lens = tuple[float, float, float, float]  # fx, fy, cx, cy, px
+ColmapLens = tuple[str, int, int, list[float]]  # model, width, height, parameters
 Pose = tuple[str, int, list[float], list[float]]  # name, number of the lens, quaternion wxyz, translation
 
 
@@ -57,10 +57,7 @@ def read_cameras(
 ) -> tuple[Camera, ...]:
     """Read a nerfstudio transforms.json, an Inria cameras.json or a COLMAP folder, told apart by content.
 
-    Returns
-    -------
-    tuple of Camera
-        In the file's order: OpenCV axes, world→camera, pixel centres at integer + ½, focal lengths in pixels.
+    In the file's order: OpenCV axes, world→camera, pixel centres at integer + ½, focal lengths in pixels.
 
     Raises
     ------
@@ -86,13 +83,12 @@ def read_cameras(
             raise BadInput(f"{path} holds no cameras: a transforms.json, cameras.json or COLMAP folder expected")
     if not cameras:
         raise BadInput(f"{path} holds no camera")
-    names: dict[str, str] = {}
+    names: dict[str, Camera] = {}
     for c in cameras:
-        name = output_name(c.id)
-        if name in names:
-            both = f"IDs, {names[name]} and {c.id}, whose pictures would have one name"
-            raise BadInput(f"{path}: two cameras have {f'the ID {c.id}' if names[name] == c.id else both}")
-        names[name] = c.id
+        other = names.setdefault(output_name(c.id), c)
+        if other is not c:
+            both = f"IDs, {other.id} and {c.id}, whose pictures would have one name"
+            raise BadInput(f"{path}: two cameras have {f'the ID {c.id}' if other.id == c.id else both}")
     return cameras
 
 
@@ -106,7 +102,7 @@ def write_transforms(path: Path | str, cameras: Sequence[Camera]) -> None:
         lens = {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy}
         pose = (np.linalg.inv(c.viewmat) @ OPENGL_TO_OPENCV).tolist()
         frame = {"file_path": c.id, "split": c.split, **lens, **asdict(c.distortion or Distortion())}
-        frames.append({**frame, "transform_matrix": pose, EXACT: c.viewmat.tolist()})
+        frames.append({**frame, "transform_matrix": pose, "world_to_camera": c.viewmat.tolist()})
     write_json(Path(path), {"camera_model": "OPENCV", "frames": frames})
 
 
@@ -131,10 +127,7 @@ def rigid(
 ) -> np.ndarray:
     """A pose [4, 4] with its rotation orthonormal; a uniform scale is taken off.
 
-    Raises
-    ------
-    BadInput
-        If it is not a finite 4×4 matrix, or it mirrors, shears or flattens.
+    Raises BadInput if it is not a finite 4×4 matrix, or it mirrors, shears or flattens.
     """
     m = _numbers(matrix)
     if m.shape == (3, 4):
@@ -189,13 +182,7 @@ def make_camera(
     split: str = "train",
     image: Path | None = None,
 ) -> Camera:
-    """A checked Camera.
-
-    Raises
-    ------
-    BadInput
-        If a size, focal length or principal point makes no sense.
-    """
+    """A checked Camera; raises BadInput if a size, focal length or principal point makes no sense."""
     try:
         width, height = (int(v) for v in size)
         fx, fy, cx, cy = (float(v) for v in intrinsics)
@@ -229,7 +216,7 @@ class _Frame(Distortion):
 
     file_path: Any = None
     transform_matrix: list[list[float]] | None = None
-    world_to_camera: Any = None  # EXACT
+    world_to_camera: Any = None  # our own; counts only where transform_matrix says the same
     w: int | None = None
     h: int | None = None
     fl_x: float | None = None
@@ -258,14 +245,14 @@ def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) 
         if frame.is_fisheye:
             refuse_model("FISHEYE", where)
         photo = _photo(images or path.parent, name)
-        width, height, intrinsics = _transforms_intrinsics(frame, photo, where)
+        size, intrinsics = _transforms_intrinsics(frame, photo, where)
         extra = [k for k in ("k4", "k5", "k6") if getattr(frame, k)]
         if extra:
             raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        pose = rigid(frame.transform_matrix, where)
-        viewmat = _exactly(_inverted(pose @ OPENGL_TO_OPENCV), frame.world_to_camera)
+        viewmat = _inverted(rigid(frame.transform_matrix, where) @ OPENGL_TO_OPENCV)
+        viewmat = _exactly(viewmat, frame.world_to_camera)
         distortion = Distortion(frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
-        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, frame.split, photo))
+        cameras.append(make_camera(where, name, viewmat, size, intrinsics, distortion, frame.split, photo))
     return tuple(cameras)
 
 
@@ -276,12 +263,14 @@ def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
     return exact if same else viewmat
 
 
-def _transforms_intrinsics(
-    frame: _Frame, photo: Path, where: str
-) -> tuple[int, int, tuple[float, float, float, float]]:
+def _transforms_intrinsics(frame: _Frame, photo: Path, where: str) -> tuple[tuple[int, int], Lens]:
     width, height, fx = frame.w, frame.h, frame.fl_x
     if width is None or height is None:
-        width, height = _image_size(photo, where)
+        from .images import read_image  # needs OpenCV, which files that name their size do without
+
+        if not photo.exists():
+            raise BadInput(f"{where}: no image size (w, h) and no photo {photo} to take it from")
+        height, width = read_image(photo).shape[:2]
     if fx is None and frame.camera_angle_x is not None:
         angle = checked(LensAngle, frame.camera_angle_x, f"{where}: camera_angle_x")
         fx = 0.5 * width / math.tan(0.5 * angle)
@@ -289,16 +278,7 @@ def _transforms_intrinsics(
         raise BadInput(f"{where}: no focal length (fl_x or camera_angle_x)")
     fy = fx if frame.fl_y is None else frame.fl_y
     cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
-    return width, height, (fx, fy, cx, cy)
-
-
-def _image_size(photo: Path, where: str) -> tuple[int, int]:
-    from .images import read_image  # needs OpenCV, which files that name their size do without
-
-    if not photo.exists():
-        raise BadInput(f"{where}: no image size (w, h) and no photo {photo} to take it from")
-    height, width = read_image(photo).shape[:2]
-    return width, height
+    return (width, height), (fx, fy, cx, cy)
 
 
 def _photo(folder: Path, name: str) -> Path:
@@ -335,9 +315,9 @@ def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[C
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers")
         name = camera_id(entry.img_name, where)
         viewmat = _inverted(rigid(np.column_stack([rotation, position]), where))
-        size, focal = (entry.width, entry.height), (entry.fx, entry.fy)
-        intrinsics, photo = (*focal, entry.width / 2, entry.height / 2), _photo(images or path.parent, name)
-        cameras.append(make_camera(where, name, viewmat, size, intrinsics, None, "train", photo))
+        intrinsics = entry.fx, entry.fy, entry.width / 2, entry.height / 2
+        photo = _photo(images or path.parent, name)
+        cameras.append(make_camera(where, name, viewmat, (entry.width, entry.height), intrinsics, image=photo))
     return tuple(cameras)
 
 
@@ -347,12 +327,9 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
         raise BadInput(f"{folder} holds no COLMAP model (cameras and images, .bin or .txt)")
     binary = (model / "images.bin").exists()
     read_lenses, read_poses = (_lenses_bin, _poses_bin) if binary else (_lenses_txt, _poses_txt)
-    try:
+    damaged = refusing(f"the COLMAP model in {model} is damaged", *COLMAP_DAMAGE)
+    with damaged, refusing(f"cannot read the COLMAP model in {model}", OSError):
         lenses, poses = read_lenses(model), read_poses(model)
-    except OSError as error:
-        raise BadInput(f"cannot read the COLMAP model in {model} ({error.strerror})") from None
-    except (struct.error, ValueError, IndexError, KeyError, OverflowError) as error:
-        raise BadInput(f"the COLMAP model in {model} is damaged ({error})") from None
     if images is None:
         near = (place / "images" for place in (folder, folder.parent, folder.parent.parent))
         images = next((f for f in near if f.is_dir()), folder)
@@ -369,8 +346,8 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             raise BadInput(f"{where}: the pose is not finite")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quats_to_matrices(np.array([quat]))[0], translation
-        photo = images / name
-        cameras.append(make_camera(where, name, viewmat, (width, height), intrinsics, distortion, "train", photo))
+        size = width, height
+        cameras.append(make_camera(where, name, viewmat, size, intrinsics, distortion, image=images / name))
     return tuple(sorted(cameras, key=lambda c: c.id))
 
 
@@ -378,9 +355,7 @@ def _is_model(folder: Path) -> bool:
     return any((folder / f"cameras{e}").exists() and (folder / f"images{e}").exists() for e in (".bin", ".txt"))
 
 
-def _colmap_intrinsics(
-    kind: str, parameters: Sequence[float], where: str
-) -> tuple[tuple[float, float, float, float], Distortion | None]:
+def _colmap_intrinsics(kind: str, parameters: Sequence[float], where: str) -> tuple[Lens, Distortion | None]:
     names = COLMAP_MODELS.get(kind, "?").split()
     p = dict(zip(names, parameters))
     if "?" in names or any(p.get(k) for k in ("k4", "k5", "k6")):
@@ -397,7 +372,7 @@ def _data_lines(path: Path) -> list[str]:
     return [line.rstrip("\r") for line in lines if not line.startswith("#")]
 
 
-def _lenses_txt(model: Path) -> dict[int, Lens]:
+def _lenses_txt(model: Path) -> dict[int, ColmapLens]:
     rows = [line.split() for line in _data_lines(model / "cameras.txt") if line.strip()]
     return {int(r[0]): (r[1], int(r[2]), int(r[3]), [float(v) for v in r[4:]]) for r in rows}
 
@@ -409,7 +384,7 @@ def _poses_txt(model: Path) -> list[Pose]:
     return [(w[9], int(w[8]), [float(v) for v in w[1:5]], [float(v) for v in w[5:8]]) for w in words]
 
 
-def _lenses_bin(folder: Path) -> dict[int, Lens]:
+def _lenses_bin(folder: Path) -> dict[int, ColmapLens]:
     data = require_file(folder / "cameras.bin").read_bytes()
     (count,), at, found = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):

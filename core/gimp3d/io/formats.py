@@ -15,18 +15,18 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..errors import BadInput
+from ..errors import BadInput, refusing
 from ..files import require_file
 from ..gaussians import SH_C0, Gaussians
 from ..memory import GAUSSIAN, require_memory
 from ..schema import checked, parse_json
-from .picture_size import announced_pixels
 from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 SPZ_MAGIC = b"NGSP"
 SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
 DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
+SOG_DAMAGE = (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError)
 SPZ_HEADER = 16  # bytes
 LARGEST_META = 16 << 20  # bytes of a SOG's meta.json; codebooks have 256 entries
 LARGEST_PACKED = 1 << 31  # bytes of a SOG's picture
@@ -40,20 +40,17 @@ HALF_TURN_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], n
 def read_scene(path: Path | str) -> SplatFile:
     """Read a splat scene of any kind: PLY (plain or compressed), .splat, .spz, .sog or an unpacked SOG folder.
 
-    Raises
-    ------
-    BadInput
-        If the file is missing, damaged or of no known kind, saying which.
+    Raises BadInput if the file is missing, damaged or of no known kind, saying which.
     """
     path = Path(path)
-    try:
+    with refusing(f"{path} is damaged", *DAMAGE), refusing(f"cannot read {path}", OSError):
         if path.is_dir() or path.name == "meta.json":
             folder = path if path.is_dir() else path.parent
             return file_of(_from_sog(lambda name: require_file(folder / Path(name).name).open("rb"), path))
         with require_file(path).open("rb") as f:
             start = f.read(4)
         if start[:3] == b"ply":
-            compressed = any(e.name == "chunk" for e in header_of(path).elements)
+            compressed = any(e.name == "chunk" for e in header_of(path)[1])
             return file_of(_from_compressed_ply(path)) if compressed else read_ply(path)
         if start == SPZ_MAGIC or start[:2] == b"\x1f\x8b":
             return file_of(_from_spz(path))
@@ -62,10 +59,6 @@ def read_scene(path: Path | str) -> SplatFile:
                 return file_of(_from_sog(archive.open, path))
         if path.suffix.lower() == ".splat":
             return file_of(_from_splat(path))
-    except OSError as error:
-        raise BadInput(f"cannot read {path} ({error.strerror or error})") from None
-    except DAMAGE as error:
-        raise BadInput(f"{path} is damaged ({error})") from None
     raise BadInput(f"{path} is not a PLY, nor a .splat, .spz or .sog scene")
 
 
@@ -78,15 +71,15 @@ def _from_splat(path: Path) -> Gaussians:
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(rows["scale"])
     quats, colour = (rows["quat"].astype(np.float32) - 128) / 128, rows["rgba"] / 255
-    return _gaussians(rows["mean"], log_scales, quats, colour[:, 3], (colour[:, :3] - 0.5) / SH_C0)
+    return _gaussians(path, rows["mean"], log_scales, quats, colour[:, 3], (colour[:, :3] - 0.5) / SH_C0)
 
 
 def _from_compressed_ply(path: Path) -> Gaussians:
     """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
-    header, data = header_of(path), path.read_bytes()
-    tables, offset = {}, header.size
-    try:
-        for element in header.elements:
+    _, elements, offset = header_of(path)
+    data, tables = path.read_bytes(), {}
+    with refusing(f"{path}: a damaged compressed PLY", KeyError, ValueError):
+        for element in elements:
             kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
             if offset + element.count * kind.itemsize > len(data):
                 raise BadInput(f"{path} is truncated: element {element.name} is not whole")
@@ -101,20 +94,17 @@ def _from_compressed_ply(path: Path) -> Gaussians:
             low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
             return low + unit * (high - low)
 
-        means = between(_unpack(vertex["packed_position"], (21, 11, 0), (11, 10, 11)), ("x", "y", "z"))
-        sizes = _unpack(vertex["packed_scale"], (21, 11, 0), (11, 10, 11))
-        log_scales = between(sizes, ("scale_x", "scale_y", "scale_z"))
-        rgba = _unpack(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
+        means = between(_unpack(vertex["packed_position"], 11, 10, 11), ("x", "y", "z"))
+        log_scales = between(_unpack(vertex["packed_scale"], 11, 10, 11), ("scale_x", "scale_y", "scale_z"))
+        rgba = _unpack(vertex["packed_color"], 8, 8, 8, 8)
         rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
         packed = vertex["packed_rotation"]
-        quats = _smallest_three(_unpack(packed, (20, 10, 0), (10, 10, 10)), (packed >> 30).astype(int))
+        quats = _smallest_three((_unpack(packed, 10, 10, 10) - 0.5) * 2 * SQRT_HALF, (packed >> 30).astype(int))
         rest, higher = tables.get("sh"), None
         if rest is not None and rest.dtype.names:
             steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
             higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
-    except (KeyError, ValueError) as error:
-        raise BadInput(f"{path}: a damaged compressed PLY ({error})") from None
-    return _gaussians(means, log_scales, quats, rgba[:, 3], (rgb - 0.5) / SH_C0, higher, path)
+    return _gaussians(path, means, log_scales, quats, rgba[:, 3], (rgb - 0.5) / SH_C0, higher)
 
 
 def _from_spz(path: Path) -> Gaussians:
@@ -127,38 +117,29 @@ def _from_spz(path: Path) -> Gaussians:
     version, n, sh_degree, fraction_bits, flags = struct.unpack("<IIBBB", body[4:15])
     if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS or (version == 4) == packed or fraction_bits > 24:
         raise BadInput(f"{path}: .spz version {version} with SH degree {sh_degree} is not known")
-    row = (6 if version == 1 else 9) + 7 + (4 if version >= 3 else 3) + 3 * SPZ_SH_COUNTS[sh_degree]
-    require_memory(n * (row + GAUSSIAN), f"{path} with {n} Gaussians")
-    size = SPZ_HEADER + n * row  # what its count needs; whatever else is packed there is not unpacked
+    count = SPZ_SH_COUNTS[sh_degree]
+    widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * count)  # bytes of each property
+    require_memory(n * (sum(widths) + GAUSSIAN), f"{path} with {n} Gaussians")
+    size = SPZ_HEADER + n * sum(widths)  # what its count needs; whatever else is packed there is not unpacked
     body = _inflated(data, size + 1) if packed else _unpacked_spz_4(data, size, path)
-    offset = SPZ_HEADER
-
-    def take(count: int, kind: str = "u1") -> np.ndarray:
-        nonlocal offset
-        size = count * np.dtype(kind).itemsize
-        if offset + size > len(body):
-            raise BadInput(f"{path} is truncated")
-        offset += size
-        return np.frombuffer(body, kind, count, offset - size)
-
+    if len(body) < size:
+        raise BadInput(f"{path} is truncated")
+    parts = np.split(np.frombuffer(body, np.uint8)[SPZ_HEADER:size], n * np.cumsum(widths[:-1]))
+    position, alpha, colour, scale, rotation, sh = (p.reshape(n, w) for p, w in zip(parts, widths))
     if version == 1:
-        means = take(3 * n, "<f2").reshape(n, 3).astype(np.float64)
+        means = position.view("<f2").astype(np.float64)
     else:
-        low, middle, high = take(9 * n).reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
+        low, middle, high = position.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
         fixed = low | middle << 8 | high << 16
         means = np.where(fixed & 0x800000, fixed - (1 << 24), fixed) / (1 << fraction_bits)
-    opacity = take(n) / 255
-    dc = (take(3 * n).reshape(n, 3) / 255 - 0.5) / 0.15
-    log_scales = take(3 * n).reshape(n, 3) / 16 - 10
     if version >= 3:
-        quats = _spz_quats(take(4 * n).view("<u4"))
+        quats = _spz_quats(rotation.view("<u4")[:, 0])
     else:
-        xyz = take(3 * n).reshape(n, 3) / 127.5 - 1
+        xyz = rotation / 127.5 - 1
         quats = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
-    count = SPZ_SH_COUNTS[sh_degree]
-    higher = ((take(3 * count * n).reshape(n, count, 3).astype(np.float32) - 128) / 128) * HALF_TURN_SH[:count, None]
-    turned = quats * [1, 1, -1, -1]
-    return _gaussians(means * [1, -1, -1], log_scales, turned, opacity, dc, higher, path, bool(flags & 1))
+    higher = ((sh.reshape(n, count, 3).astype(np.float32) - 128) / 128) * HALF_TURN_SH[:count, None]
+    means, quats, dc = means * [1, -1, -1], quats * [1, 1, -1, -1], (colour / 255 - 0.5) / 0.15
+    return _gaussians(path, means, scale / 16 - 10, quats, alpha[:, 0] / 255, dc, higher, bool(flags & 1))
 
 
 def _inflated(data: bytes, size: int) -> bytes:
@@ -179,38 +160,27 @@ def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
         import zstandard
     except ImportError:
         raise BadInput(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard") from None
-    if len(data) < 20:
-        raise BadInput(f"{path} is truncated")
-    streams, table = data[15], struct.unpack("<I", data[16:20])[0]
-    offset = table + 16 * streams
-    if offset > len(data):
+    table = int.from_bytes(data[16:20], "little")  # of the streams, whose number is the header's last byte
+    offset = table + 16 * data[15]
+    if len(data) < max(20, offset):
         raise BadInput(f"{path} is truncated")
     body = bytearray(data[:SPZ_HEADER])
     for packed, unpacked in struct.iter_unpack("<QQ", data[table:offset]):
         if len(body) + unpacked > size:
             raise BadInput(f"{path} is damaged: a stream of {unpacked} bytes is more than its Gaussians need")
-        try:  # as a stream, as a frame's own word for its size may be a lie
+        with refusing(f"{path} is damaged", zstandard.ZstdError, MemoryError):
+            # as a stream, as a frame's own word for its size may be a lie
             stream = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data[offset : offset + packed])
             body += stream.read(unpacked)
-        except (zstandard.ZstdError, MemoryError) as error:
-            raise BadInput(f"{path} is damaged ({error})") from None
         offset += packed
     return bytes(body)
 
 
 def _spz_quats(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] from three components of 9 bits and a sign, in the order x, y, z, w."""
-    rest, largest = packed.astype(np.uint32), (packed >> 30).astype(int)
-    xyzw, squares = np.zeros((len(packed), 4)), np.zeros(len(packed))
-    for k in (3, 2, 1, 0):
-        stored = largest != k
-        size = (rest & 511) / 511 * SQRT_HALF
-        value = np.where(stored, np.where(rest >> 9 & 1, -size, size), 0)
-        xyzw[:, k] = value
-        squares += value**2
-        rest = np.where(stored, rest >> 10, rest)
-    xyzw[np.arange(len(packed)), largest] = np.sqrt(np.maximum(0, 1 - squares))
-    return xyzw[:, [3, 0, 1, 2]]
+    """Quaternions wxyz [N, 4] from three components of 9 bits and a sign, in the order w, z, y, x from the lowest."""
+    fields = np.stack([packed >> shift & 1023 for shift in (0, 10, 20)], 1)
+    small = (fields & 511) / 511 * SQRT_HALF * np.where(fields >> 9, -1, 1)
+    return _smallest_three(small, 3 - (packed >> 30).astype(int))[:, [0, 3, 2, 1]]
 
 
 def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
@@ -220,8 +190,8 @@ def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
         with opened(name) as file:
             return file.read(most)
 
-    try:
-        where = f"{path}: meta.json"
+    where = f"{path}: meta.json"
+    with refusing(f"{where} or a picture of the SOG scene is damaged", *SOG_DAMAGE):
         document = parse_json(read("meta.json", LARGEST_META + 1), where, LARGEST_META)
         meta: dict[str, Any] = checked(dict[str, Any], document, where)
         version = int(meta.get("version", 1))
@@ -257,7 +227,7 @@ def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
             rgba = decoded("sh0", colour)
             dc, opacity = rgba[:, :3], 1 / (1 + np.exp(-rgba[:, 3]))
         packed = pixels("quats")
-        quats = _smallest_three(packed[:, :3] / 255, packed[:, 3].astype(int) - 252)
+        quats = _smallest_three((packed[:, :3] / 255 - 0.5) * 2 * SQRT_HALF, packed[:, 3].astype(int) - 252)
         higher = None
         if "shN" in meta:
             entries = picture("shN", 0, LARGEST_PALETTE)
@@ -265,9 +235,7 @@ def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
             palette = decoded("shN", entries[..., :3].reshape(-1, count, 3))
             labels = pixels("shN", 1).astype(int)
             higher = palette[labels[:, 0] + 256 * labels[:, 1]]
-    except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
-        raise BadInput(f"{path}: meta.json or a picture of the SOG scene is damaged ({error})") from None
-    return _gaussians(means, log_scales, quats, opacity, dc, higher, path)
+    return _gaussians(path, means, log_scales, quats, opacity, dc, higher)
 
 
 def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
@@ -275,7 +243,7 @@ def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     try:
         import cv2
 
-        from .images import decoded
+        from .images import announced_pixels, decoded
     except ImportError:
         raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
     if announced_pixels(data) > most:
@@ -286,17 +254,16 @@ def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA if picture.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
-def _unpack(packed: np.ndarray, shifts: tuple[int, ...], bits: tuple[int, ...]) -> np.ndarray:
-    """Bit fields as numbers in [0, 1], [N, fields]."""
-    return np.stack([(packed >> s & ((1 << b) - 1)) / ((1 << b) - 1) for s, b in zip(shifts, bits)], 1)
+def _unpack(packed: np.ndarray, *bits: int) -> np.ndarray:
+    """Bit fields, the last one in the lowest bits, as numbers in [0, 1], [N, fields]."""
+    return np.stack([(packed >> sum(bits[k + 1 :]) & ((1 << b) - 1)) / ((1 << b) - 1) for k, b in enumerate(bits)], 1)
 
 
-def _smallest_three(stored: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] from their three smaller components [N, 3] in [0, 1] and the number of the largest."""
+def _smallest_three(small: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Quaternions [N, 4] from their three smaller components [N, 3] in order and the number of the largest."""
     if len(largest) and not 0 <= largest.min() <= largest.max() <= 3:
         raise ValueError("a quaternion names no largest component")
-    small = (stored - 0.5) * 2 * SQRT_HALF
-    quats = np.empty((len(stored), 4))
+    quats = np.empty((len(small), 4))
     for k in range(4):
         rows = largest == k
         quats[rows] = np.insert(small[rows], k, np.sqrt(np.maximum(0, 1 - (small[rows] ** 2).sum(1))), axis=1)
@@ -304,18 +271,18 @@ def _smallest_three(stored: np.ndarray, largest: np.ndarray) -> np.ndarray:
 
 
 def _gaussians(
+    path: Path,
     means: np.ndarray,
     log_scales: np.ndarray,
     quats: np.ndarray,
     opacity: np.ndarray,  # [N] in steps of 1/255
     dc: np.ndarray,  # [N, 3]
     higher: np.ndarray | None = None,  # [N, K, 3]
-    path: Path | str = "",
     antialiased: bool = False,
 ) -> Gaussians:
     # 0 and 255 stand for what was rounded to them; their logits would be infinite.
     alpha = np.clip(opacity, 0.25 / 255, 1 - 0.25 / 255)
-    try:
+    with refusing(f"{path}: its parts do not fit together", ValueError):
         sh = dc[:, None] if higher is None or not higher.size else np.concatenate([dc[:, None], higher], 1)
         if sh.shape[1] not in (1, 4, 9, 16):
             raise BadInput(f"{path}: {sh.shape[1] - 1} SH coefficients per colour; 0, 3, 8 or 15 expected")
@@ -327,5 +294,3 @@ def _gaussians(
             sh=sh.astype(np.float32),
             antialiased=antialiased,
         )
-    except ValueError as error:
-        raise BadInput(f"{path}: its parts do not fit together ({error})") from None

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from ..camera import Camera
-from ..errors import BadInput
+from ..camera import LARGEST_PICTURE, Camera
+from ..errors import BadInput, refusing
 from ..files import require_file, write_atomically
 from ..memory import require_memory
-from .picture_size import announced_pixels, is_broken_png, most_pixels
 
+PNG = b"\x89PNG\r\n\x1a\n"
+DENSEST = 8 * 1032  # pixels that a byte of a PNG or JPEG can hold: deflate's most bytes, of one bit each
 SMALLEST = 1 / 16  # of a camera's width: a photo of less is a thumbnail or a mistake
 PIXEL = 16  # bytes that a picture takes while it is read, about: of 8 bits and three channels 9, with alpha 28
 ASPECT_TOLERANCE = 1.5  # px by which a photo's size may differ from the scaled camera's, from rounding
@@ -22,15 +24,10 @@ ASPECT_TOLERANCE = 1.5  # px by which a photo's size may differ from the scaled 
 def read_image(path: Path | str) -> np.ndarray:
     """A picture as [H, W, 3] uint8 RGB; 16 bit is reduced, grey repeated, alpha composited on black.
 
-    Raises
-    ------
-    BadInput
-        If it is missing or not a picture.
+    Raises BadInput if it is missing or not a picture.
     """
-    try:
+    with refusing(f"cannot read the picture {path}", OSError):
         data = require_file(Path(path)).read_bytes()  # cv2.imread fails on non-ASCII names on Windows
-    except OSError as error:
-        raise BadInput(f"cannot read the picture {path} ({error.strerror})") from None
     return decode_image(data, str(path))
 
 
@@ -52,15 +49,13 @@ def decode_image(data: bytes, name: str) -> np.ndarray:
 def decoded(data: bytes, name: str, way: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
     """A picture file's bytes as OpenCV gives them; no memory is taken for what they only claim.
 
-    Raises
-    ------
-    BadInput
-        If they are no picture, or one that claims more than they can hold.
+    Raises BadInput if they are no picture, or one that claims more than they can hold.
     """
     if is_broken_png(data):
         raise BadInput(f"{name} is not a picture that can be read (a PNG that is cut off or damaged)")
     size = announced_pixels(data)
-    if size > most_pixels(data):
+    # a PNG's and a JPEG's bytes limit what they hold, a WebP's do not
+    if size > (LARGEST_PICTURE if data[8:12] == b"WEBP" else min(LARGEST_PICTURE, DENSEST * len(data))):
         raise BadInput(f"{name} claims {size:,} pixels, more than such a file can hold")
     require_memory(PIXEL * size, f"{name} with {size:,} pixels")
     try:
@@ -70,6 +65,54 @@ def decoded(data: bytes, name: str, way: int = cv2.IMREAD_UNCHANGED) -> np.ndarr
     if picture is None:
         raise BadInput(f"{name} is not a picture that can be read")
     return picture
+
+
+def announced_pixels(data: bytes) -> int:
+    """How many pixels the header of a PNG, JPEG or WebP announces; 0 for other files, of which OpenCV has a limit."""
+    if data.startswith(PNG) and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width * height
+    if data[:2] == b"\xff\xd8":
+        return _jpeg_pixels(data)
+    if data[8:12] == b"WEBP" and len(data) >= 30:
+        return _webp_pixels(data)
+    return 0
+
+
+def is_broken_png(data: bytes) -> bool:
+    """Whether a PNG's chunks do not lead from its header by its pixels to its end.
+
+    OpenCV takes memory, hundreds of megabytes, for whatever length the next four bytes claim.
+    """
+    at, kinds = len(PNG), [b""]
+    while data.startswith(PNG) and at < len(data) and kinds[-1] != b"IEND":
+        kinds.append(data[at + 4 : at + 8])
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    whole = kinds[1:2] == [b"IHDR"] and b"IDAT" in kinds and kinds[-1] == b"IEND" and at <= len(data)
+    return data.startswith(PNG) and not whole
+
+
+def _jpeg_pixels(data: bytes) -> int:
+    """What the first frame header says, found as libjpeg finds it: segments are skipped, and whatever is no marker."""
+    at = data.find(b"\xff", 2)
+    while 0 <= at < len(data) - 8:
+        marker = data[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return height * width
+        alone = marker in (0, 1) or 0xD0 <= marker <= 0xD8
+        skipped = 1 if marker == 0xFF else 2 if alone else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        at = data.find(b"\xff", at + skipped)
+    return 0
+
+
+def _webp_pixels(data: bytes) -> int:
+    if data[12:16] == b"VP8L":
+        sizes = int.from_bytes(data[21:25], "little")
+        return ((sizes & 0x3FFF) + 1) * ((sizes >> 14 & 0x3FFF) + 1)
+    if data[12:16] == b"VP8X":
+        return (int.from_bytes(data[24:27], "little") + 1) * (int.from_bytes(data[27:30], "little") + 1)
+    return (int.from_bytes(data[26:28], "little") & 0x3FFF) * (int.from_bytes(data[28:30], "little") & 0x3FFF)
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -96,19 +139,8 @@ def encode_png(picture: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def undistorted(camera: Camera) -> Camera:
-    """The pinhole camera of the same K whose pictures `load_view` gives."""
-    return replace(camera, distortion=None)
-
-
 def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
-    """A camera's photo, resampled to the camera's size and undistorted, and its pinhole camera.
-
-    Returns
-    -------
-    photo : ndarray, [H, W, 3] uint8
-    camera : Camera
-        Without distortion, of the same size.
+    """A camera's photo [H, W, 3] uint8, resampled to the camera's size and undistorted, and its pinhole camera.
 
     Raises
     ------
@@ -136,4 +168,4 @@ def load_view(camera: Camera) -> tuple[np.ndarray, Camera]:
     if camera.distortion is not None:
         at_integers = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's pixel centres are whole numbers
         photo = cv2.undistort(photo, at_integers, camera.distortion.coefficients)
-    return photo, undistorted(camera)
+    return photo, replace(camera, distortion=None)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import BadInput
+from ..errors import BadInput, refusing
 from ..files import require_file, write_atomically
 from ..gaussians import Gaussians, pad_sh
 
@@ -24,6 +24,7 @@ TYPES = {
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 CACHED_ROWS = 1 << 12
 MAX_HEADER = 1 << 20  # bytes; a longer header is not a PLY's
+Body = tuple[bytes, np.ndarray, bytes]  # before the vertices, their rows, and behind them
 ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip\b|\bantialiased\s+1\b", re.IGNORECASE)
 
 
@@ -62,18 +63,12 @@ class PlyTable:
 class SplatFile:
     """A scene and the file it came from."""
 
-    gaussians: Gaussians
-    table: PlyTable
+    gaussians: Gaussians  # in float32, with quaternions as they are
+    table: PlyTable  # the file's rows as they are, for `write_ply`
 
 
 def read_ply(path: Path | str) -> SplatFile:
     """Read a Gaussian PLY (3DGS or 2DGS), by the names of its properties.
-
-    Returns
-    -------
-    SplatFile
-        `gaussians`: means [N, 3] and log_scales [N, 3 or 2] in scene units, quats [N, 4] as wxyz, opacity_logits [N],
-        sh [N, K, 3]; `table`: the file's rows as they are, for `write_ply`.
 
     Raises
     ------
@@ -86,8 +81,25 @@ def read_ply(path: Path | str) -> SplatFile:
     >>> file.gaussians.means.dtype, file.gaussians.sh.shape[1:]
     (dtype('float32'), (1, 3))
     """
-    path = Path(path)
-    table = read_table(path)
+    head, elements, start = header_of(Path(path))
+    names = [e.name for e in elements]
+    if "chunk" in names or any(p.name.startswith("packed_") for e in elements for p in e.properties):
+        raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it with gimp3d convert first")
+    if names.count("vertex") != 1:
+        raise BadInput(f"{path}: a PLY with one vertex element expected, found {names.count('vertex')}")
+    vertex = elements[names.index("vertex")]
+    if any(p.type == "list" for p in vertex.properties):
+        raise BadInput(f"{path}: the vertex element has a list property; that is not a Gaussian scene")
+    seen = [p.name for p in vertex.properties]
+    twice = sorted({n for n in seen if seen.count(n) > 1})
+    if twice:
+        raise BadInput(f"{path}: property {', '.join(twice)} occurs twice in the vertex element")
+    if vertex.count and not any(n.startswith("f_dc_") for n in seen):
+        what = "it has plain colours (red, green, blue)" if "red" in seen else "a mesh or a point cloud"
+        raise BadInput(f"{path} is not a Gaussian scene: no property f_dc_0, {what}")
+    read = _read_ascii if head.format == "ascii" else _read_binary
+    before, rows, after = read(Path(path), elements, names.index("vertex"), start)
+    table = replace(head, properties=tuple(vertex.properties), rows=rows, before=before, after=after)
     return SplatFile(gaussians_of(table, path), table)
 
 
@@ -117,27 +129,24 @@ def write_ply(
     """
     if keep.shape != (len(file.table.rows),) or keep.dtype != bool:
         raise ValueError(f"keep: {len(file.table.rows)} bools expected, got {keep.dtype} {keep.shape}")
-    table, count = file.table, int(np.count_nonzero(keep)) + (len(added) if added is not None else 0)
-    lines = [f"element vertex {count}" if h.split()[:2] == ["element", "vertex"] else h for h in table.header]
+    table = file.table
+    new = np.zeros(0, table.dtype) if added is None else new_rows(table, added)
+    for name in new.dtype.names or ():
+        if not np.isfinite(new[name]).all():
+            raise ValueError(f"a new Gaussian has a {name} that is not finite")
+    count = f"element vertex {keep.sum() + len(new)}"
+    lines = [count if h.split()[:2] == ["element", "vertex"] else h for h in table.header]
     header = table.line_end.join([*lines, "end_header", ""]).encode("latin-1")
-    kept = table.rows if np.all(keep) else table.rows[np.asarray(keep, dtype=bool)]
-    new = None
-    if added is not None and len(added):
-        new = new_rows(table, added)
-        for name in new.dtype.names or ():
-            if not np.isfinite(new[name]).all():
-                raise ValueError(f"a new Gaussian has a {name} that is not finite")
+    kept = table.rows if keep.all() else table.rows[keep]
 
     def write(f):  # type: ignore[no-untyped-def]
         f.write(header)
         f.write(table.before)
         if table.format == "ascii":
-            lines = [*kept, *(() if new is None else ascii_rows(new))]
-            f.write(b"".join(line + table.line_end.encode() for line in lines))
+            f.write(b"".join(line + table.line_end.encode() for line in (*kept, *ascii_rows(new))))
         else:
             f.write(np.ascontiguousarray(kept).view(np.uint8))
-            if new is not None:
-                f.write(new.tobytes())
+            f.write(new.tobytes())
         f.write(table.after)
 
     write_atomically(Path(path), write)
@@ -145,8 +154,7 @@ def write_ply(
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, comments: Sequence[str] = ()) -> None:
     """Write a fresh binary PLY in Inria's layout."""
-    file = file_of(gaussians, comments)
-    write_ply(path, file, np.ones(len(gaussians), bool))
+    write_ply(path, file_of(gaussians, comments), np.ones(len(gaussians), bool))
 
 
 def file_of(gaussians: Gaussians, comments: Sequence[str] = ()) -> SplatFile:
@@ -165,65 +173,6 @@ def file_of(gaussians: Gaussians, comments: Sequence[str] = ()) -> SplatFile:
 
 
 @dataclass(frozen=True)
-class PlyHeader:
-    """What a PLY announces."""
-
-    lines: tuple[str, ...]  # without line ends and `end_header`
-    line_end: str
-    format: str
-    elements: tuple[PlyElement, ...]
-    size: int  # bytes up to the body
-
-
-def header_of(path: Path) -> PlyHeader:
-    """Read a PLY's header.
-
-    Raises
-    ------
-    BadInput
-        If the file cannot be read or its header is damaged.
-    """
-    try:
-        with require_file(path).open("rb") as f:
-            start = f.read(MAX_HEADER)
-    except OSError as error:
-        raise BadInput(f"cannot read {path} ({error.strerror})") from None
-    if not re.match(rb"ply\r?\n", start):
-        raise BadInput(f"{path} is not a PLY file (it does not begin with 'ply')")
-    end = re.search(rb"^end_header[ \t]*\r?\n", start, re.MULTILINE)
-    if not end:
-        raise BadInput(f"{path}: the PLY header has no end_header; the file is damaged")
-    line_end = "\r\n" if start[3:4] == b"\r" else "\n"
-    lines = [line.rstrip("\r") for line in start[: end.start()].decode("latin-1").split("\n")[:-1]]
-    form, elements = _parse_header(path, lines)
-    return PlyHeader(tuple(lines), line_end, form, tuple(elements), end.end())
-
-
-def read_table(path: Path) -> PlyTable:
-    """Read a PLY's header and vertex rows without interpreting them."""
-    head = header_of(path)
-    elements = head.elements
-    names = [e.name for e in elements]
-    if "chunk" in names or any(p.name.startswith("packed_") for e in elements for p in e.properties):
-        raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it with gimp3d convert first")
-    if names.count("vertex") != 1:
-        raise BadInput(f"{path}: a PLY with one vertex element expected, found {names.count('vertex')}")
-    vertex = elements[names.index("vertex")]
-    if any(p.type == "list" for p in vertex.properties):
-        raise BadInput(f"{path}: the vertex element has a list property; that is not a Gaussian scene")
-    seen = [p.name for p in vertex.properties]
-    twice = sorted({n for n in seen if seen.count(n) > 1})
-    if twice:
-        raise BadInput(f"{path}: property {', '.join(twice)} occurs twice in the vertex element")
-    if vertex.count and not any(n.startswith("f_dc_") for n in seen):
-        what = "it has plain colours (red, green, blue)" if "red" in seen else "a mesh or a point cloud"
-        raise BadInput(f"{path} is not a Gaussian scene: no property f_dc_0, {what}")
-    read = _read_ascii if head.format == "ascii" else _read_binary
-    before, rows, after = read(path, elements, names.index("vertex"), head.size)
-    return PlyTable(head.lines, head.line_end, head.format, tuple(vertex.properties), rows, before, after)
-
-
-@dataclass(frozen=True)
 class PlyElement:
     """An element that a PLY announces."""
 
@@ -231,15 +180,21 @@ class PlyElement:
     count: int
     properties: list[PlyProperty] = field(default_factory=list)
 
-    @property
-    def row_bytes(self) -> int | None:
-        """None if a list makes rows of different sizes."""
-        if any(p.type == "list" for p in self.properties):
-            return None
-        return sum(np.dtype(TYPES[p.type]).itemsize for p in self.properties)
 
+def header_of(path: Path) -> tuple[PlyTable, list[PlyElement], int]:
+    """What a PLY announces: its table without rows, all its elements, and where its body begins.
 
-def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[PlyElement]]:
+    Raises BadInput if the file cannot be read or its header is damaged.
+    """
+    with refusing(f"cannot read {path}", OSError), require_file(path).open("rb") as f:
+        start = f.read(MAX_HEADER)
+    if not re.match(rb"ply\r?\n", start):
+        raise BadInput(f"{path} is not a PLY file (it does not begin with 'ply')")
+    end = re.search(rb"^end_header[ \t]*\r?\n", start, re.MULTILINE)
+    if not end:
+        raise BadInput(f"{path}: the PLY header has no end_header; the file is damaged")
+    line_end = "\r\n" if start[3:4] == b"\r" else "\n"
+    lines = [line.rstrip("\r") for line in start[: end.start()].decode("latin-1").split("\n")[:-1]]
     form, elements = "", []
     for line in lines[1:]:
         words = line.split()
@@ -257,18 +212,18 @@ def _parse_header(path: Path, lines: Sequence[str]) -> tuple[str, list[PlyElemen
             raise BadInput(f"{path}: the PLY header line {line[:60]!r} makes no sense; the file is damaged")
     if not form:
         raise BadInput(f"{path}: the PLY header names no format")
-    return form, elements
+    return PlyTable(tuple(lines), line_end, form, (), np.zeros(0, "V1")), elements, end.end()
 
 
-def _read_binary(
-    path: Path, elements: Sequence[PlyElement], vertex: int, start: int
-) -> tuple[bytes, np.ndarray, bytes]:
-    first = start
-    for element in elements[:vertex]:
-        if element.row_bytes is None:
-            raise BadInput(f"{path}: element {element.name} with lists in front of the vertices is not supported")
-        first += element.count * element.row_bytes
-    row_bytes, count, size = elements[vertex].row_bytes or 0, elements[vertex].count, path.stat().st_size
+def _row_bytes(path: Path, element: PlyElement) -> int:
+    if any(p.type == "list" for p in element.properties):  # rows of different sizes
+        raise BadInput(f"{path}: element {element.name} with lists in front of the vertices is not supported")
+    return sum(np.dtype(TYPES[p.type]).itemsize for p in element.properties)
+
+
+def _read_binary(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> Body:
+    first = start + sum(e.count * _row_bytes(path, e) for e in elements[:vertex])
+    row_bytes, count, size = _row_bytes(path, elements[vertex]), elements[vertex].count, path.stat().st_size
     if first + count * row_bytes > size:
         raise BadInput(
             f"{path} is truncated: {count} rows of {row_bytes} bytes announced, {max(0, size - first)} bytes there"
@@ -277,13 +232,11 @@ def _read_binary(
         f.seek(start)
         before = f.read(first - start)
         rows = np.fromfile(f, dtype=f"V{row_bytes}", count=count) if row_bytes else np.zeros(0, "V1")
-        after = f.read()
-    if after and vertex == len(elements) - 1:
-        after = b""  # bytes that no element announces
+        after = f.read() if vertex < len(elements) - 1 else b""  # not bytes that no element announces
     return before, rows, after
 
 
-def _read_ascii(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> tuple[bytes, np.ndarray, bytes]:
+def _read_ascii(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> Body:
     lines = path.read_bytes()[start:].splitlines(keepends=True)
     first = sum(e.count for e in elements[:vertex])
     count = elements[vertex].count
@@ -300,10 +253,7 @@ def values(table: PlyTable, path: Path | str = "PLY") -> np.ndarray:
     if table.format != "ascii":
         records = np.ascontiguousarray(table.rows).view(table.dtype) if len(table.rows) else np.zeros(0, table.dtype)
         return records.astype(table.dtype.newbyteorder("="), copy=False)
-    width = len(table.properties)
-    records = np.zeros(len(table.rows), table.dtype)
-    if len(table.rows) == 0:
-        return records
+    width, records = len(table.properties), np.zeros(len(table.rows), table.dtype)
     try:
         cells = np.array(b" ".join(table.rows).split(), dtype=np.float64)
     except ValueError:
@@ -386,9 +336,9 @@ def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
 
 def ascii_rows(records: np.ndarray) -> list[bytes]:
     """Records as text lines, each number the shortest that reads back to the same value."""
-    columns = [[_text(v) for v in records[n]] for n in records.dtype.names or ()]
+
+    def text(value: np.generic) -> str:
+        return np.format_float_positional(value, trim="-") if isinstance(value, np.floating) else str(value)
+
+    columns = ([text(v) for v in records[name]] for name in records.dtype.names or ())
     return [" ".join(cells).encode() for cells in zip(*columns)]
-
-
-def _text(value: np.generic) -> str:
-    return np.format_float_positional(value, trim="-") if isinstance(value, np.floating) else str(value)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 
-from ..errors import BadInput
+from ..errors import BadInput, one_line
 from ..io.images import decode_image, encode_png
-from .appearance import Painter
-from .calls import Call, one_line, waited
+from .calls import Call, Painter, waited
 from .pasting import scaled
 
 MODEL = "gemini-2.5-flash-image"  # Nano Banana
@@ -40,13 +40,9 @@ PROMPT = (
 def painter(model: str, call: Call) -> Painter:
     """Gemini's model of that name, or Nano Banana.
 
-    Raises
-    ------
-    BadInput
-        If going online is not allowed, there is no key in the environment, or Google's client is not installed.
+    Raises BadInput if going online is not allowed, there is no key in the environment, or Google's client is missing.
     """
-    model = model or MODEL
-    who = f"{call.option} gemini"
+    model, who = model or MODEL, f"{call.option} gemini"
     if not call.allow_network:
         raise BadInput(f"{who}: sends pictures of the scene to Google and costs money; allow it with --allow-network")
     key = next((os.environ[name] for name in KEYS if os.environ.get(name)), "")
@@ -57,33 +53,28 @@ def painter(model: str, call: Call) -> Painter:
 
     def paint(image: np.ndarray, mask: np.ndarray, seed: int, call: Call) -> np.ndarray:
         h, w = mask.shape
-        aspect, padding = padded_to(w, h)
-        size = SIZES[aspect]
+        aspect, (top, bottom, left, right) = padded_to(w, h)
+        width, height = SIZES[aspect]
+        way = cv2.BORDER_REFLECT_101 if min(w, h) > 1 else cv2.BORDER_REPLICATE
         shown, hole = (
-            cv2.copyMakeBorder(p, *padding, cv2.BORDER_REFLECT_101 if min(w, h) > 1 else cv2.BORDER_REPLICATE)
+            scaled(cv2.copyMakeBorder(p, top, bottom, left, right, way), width, height)
             for p in (np.where(mask[..., None], np.uint8(0), image), mask.astype(np.uint8) * 255)
         )
-        wide = shown.shape[1], shown.shape[0]
-        hole = scaled(hole, *size) > 0
-        shown = np.where(hole[..., None], np.array(HIDDEN, np.uint8), scaled(shown, *size))
-        data = waited(
-            model,
-            lambda: _asked(who, model, key, [encode_png(shown), encode_png(hole)], aspect, seed, call),
-            call,
-            lambda: "paints",
-        )
-        answer = decode_image(data, f"what {model} answered")
-        ratio = answer.shape[1] / answer.shape[0] / (size[0] / size[1])
-        if abs(np.log(ratio)) > OTHER_SHAPE:
+        hole = hole > 0
+        shown = np.where(hole[..., None], np.array(HIDDEN, np.uint8), shown)
+        pictures = [encode_png(shown), encode_png(hole)]
+        asked = partial(_asked, who, model, key, pictures, aspect, seed, call)
+        answer = decode_image(waited(model, asked, call, lambda: "paints"), f"what {model} answered")
+        high, wide = answer.shape[:2]
+        if abs(np.log(wide / high / (width / height))) > OTHER_SHAPE:
             raise BadInput(
-                f"{who}: {model} answers with {answer.shape[1]}×{answer.shape[0]} pixels, not the shape of the picture "
-                f"that it got ({size[0]}×{size[1]})"
+                f"{who}: {model} answers with {wide}×{high} pixels, not the shape of the picture that it got "
+                f"({width}×{height})"
             )
-        inside = scaled(answer, *size)[hole].astype(int)
+        inside = scaled(answer, width, height)[hole].astype(int)
         if len(inside) and (np.abs(inside - HIDDEN).max(1) < NEARLY).mean() > LEFT:
             raise BadInput(f"{who}: {model} left the hole as it was; try another --seed or --set prompt=…")
-        top, _, left, _ = padding
-        return scaled(answer, *wide)[top : top + h, left : left + w]
+        return scaled(answer, left + w + right, top + h + bottom)[top : top + h, left : left + w]
 
     price = f"about ${DOLLARS[model]:.2f} each" if model in DOLLARS else "its price in Google's list each"
     notice = f"pictures of the scene are sent to Google's {model}, usually one or two a removal, {price}"
@@ -92,11 +83,10 @@ def painter(model: str, call: Call) -> Painter:
 
 def padded_to(width: int, height: int) -> tuple[str, tuple[int, int, int, int]]:
     """The nearest aspect ratio that can be asked for, and the (top, bottom, left, right) px that are missing to it."""
-    ratio = width / height
-    aspect = min(SIZES, key=lambda name: abs(np.log(SIZES[name][0] / SIZES[name][1] / ratio)))
-    wanted = SIZES[aspect][0] / SIZES[aspect][1]
-    across = max(0, round(height * wanted) - width)
-    down = max(0, round(width / wanted) - height)
+    ratios = {name: wide / high for name, (wide, high) in SIZES.items()}
+    aspect = min(ratios, key=lambda name: abs(np.log(ratios[name] / (width / height))))
+    across = max(0, round(height * ratios[aspect]) - width)
+    down = max(0, round(width / ratios[aspect]) - height)
     return aspect, (down // 2, down - down // 2, across // 2, across - across // 2)
 
 
@@ -105,8 +95,8 @@ def _asked(who: str, model: str, key: str, pictures: list[bytes], aspect: str, s
     from google import genai
     from google.genai import errors, types
 
-    words = PROMPT + (f" The covered area shows: {call.prompt}." if call.prompt else "")
     contents: list[Any] = [types.Part.from_bytes(data=data, mime_type="image/png") for data in pictures]
+    contents.append(PROMPT + (f" The covered area shows: {call.prompt}." if call.prompt else ""))
     options = types.HttpOptions(
         timeout=int(1000 * call.seconds),
         retry_options=types.HttpRetryOptions(attempts=ATTEMPTS, initial_delay=PAUSE, jitter=PAUSE),
@@ -119,7 +109,7 @@ def _asked(who: str, model: str, key: str, pictures: list[bytes], aspect: str, s
     )
     try:
         client = genai.Client(vertexai=False, api_key=key, http_options=options)
-        answer = client.models.generate_content(model=model, contents=[*contents, words], config=config)
+        answer = client.models.generate_content(model=model, contents=contents, config=config)
     except errors.APIError as error:
         raise BadInput(f"{who}: Google refused ({error.code} {error.status}): {one_line(error.message)}") from None
     except Exception as error:  # of whatever library the client has for its connections

@@ -1,39 +1,42 @@
-"""Who invents the reference without the object: the table of providers (docs/painters.md).
+"""Who invents the reference without the object: providers of this program, and the table of others (docs/painters.md).
 
-A provider of this program is a function Unfinished → Appearance, named in `builtin.PROVIDERS`. Whoever paints outside
-it is a `Painter`, made by what `PAINTERS` names for its argument after the colon; its pictures are registered and
-checked like a file's (docs/developing.md).
+A provider of this program is a function Unfinished → Appearance, named in `PROVIDERS`. Whoever paints outside it is a
+`Painter`, made by what `PAINTERS` names for its argument after the colon; its pictures are registered and checked like
+a file's (docs/developing.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
+import cv2
 import numpy as np
 
 from ..errors import BadInput, IllPosed
 from ..io.images import read_image
-from . import command, gemini, onnx, servers, torchscript
-from .appearance import Appearance, Painter, Provider, Unfinished, window_round_hole
-from .builtin import PROVIDERS, without_specks
-from .calls import Call
-from .pasting import paste_picture
+from ..solvers.exemplar import ExemplarSettings, complete_picture
+from . import gemini, networks, servers
+from .calls import Call, Painter, command_painter
+from .pasting import Appearance, interpolated, paste_picture, window_round_hole
 
 __all__ = ["PAINTERS", "PROVIDERS", "Appearance", "check_provider", "inpaint_reference", "painter", "paste_picture"]
 
-PAINTERS: dict[str, Callable[[str, Call], Painter]] = {
-    "onnx": onnx.painter,
-    "torchscript": torchscript.painter,
-    "gemini": gemini.painter,
-    "http": lambda rest, call: servers.painter(f"http:{rest}", call),
-    "https": lambda rest, call: servers.painter(f"https:{rest}", call),
-    "command": command.painter,
-}
-WITHOUT_ARGUMENT = ("gemini",)  # they may have one
-CHOICES = ", ".join(
-    [*PROVIDERS, "file:PATH", "onnx:PATH", "torchscript:PATH", "gemini[:MODEL]", "http://HOST:PORT or command:CMD"]
-)
+SPECK = 4  # px; smaller parts of a hole are interpolated
+PATCHES = (13, 21, 9)  # px, of variants in turn: larger ones continue larger figures, smaller ones fit closer
+CONFIDENCE_SCALE = 20.0  # grey levels of misfit at which the confidence has fallen to 1/e
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """What a provider is given. It may return anything inside the hole; what it returns outside is ignored."""
+
+    image: np.ndarray  # [H, W, 3] uint8; what stands in the hole means nothing
+    hole: np.ndarray  # [H, W] bool, not empty
+    seed: int = 0  # the same seed gives the same fill
+    unknown: np.ndarray | None = None  # [H, W] bool, pixels that mean nothing either, but are not to be filled
+    variant: int = 0  # another fill of the same hole, for people to choose from
 
 
 def inpaint_reference(
@@ -47,12 +50,8 @@ def inpaint_reference(
 ) -> Appearance:
     """Fill the hole by the provider that `spec` names.
 
-    Raises
-    ------
-    BadInput
-        If the provider is unknown, or its file, program or server fails.
-    IllPosed
-        If the hole is the whole image and no picture of it is given.
+    Raises BadInput if the provider is unknown, or its file, program or server fails; IllPosed if the hole is the whole
+    image and no picture of it is given.
     """
     provider = _provider(spec, call)
     if not hole.any():
@@ -65,19 +64,11 @@ def inpaint_reference(
 
 def check_provider(spec: str, call: Call = Call()) -> str:
     """What a user has to know before the provider is asked; raises BadInput now if `inpaint_reference` would later."""
-    if spec in PROVIDERS or spec.startswith("file:"):
-        return ""
-    return painter(spec, call).notice
+    return "" if spec in PROVIDERS or spec.startswith("file:") else painter(spec, call).notice
 
 
 def painter(spec: str, call: Call = Call()) -> Painter:
-    """Who paints outside this program.
-
-    Raises
-    ------
-    BadInput
-        If there is no such painter, or it is known already that it cannot work.
-    """
+    """Who paints outside this program; raises BadInput if there is none, or it is known already that it cannot work."""
     name, _, argument = spec.partition(":")
     if name in PAINTERS and (argument or spec in WITHOUT_ARGUMENT):
         return PAINTERS[name](argument, call)
@@ -90,11 +81,10 @@ def _provider(spec: str, call: Call) -> Provider:
     name, _, argument = spec.partition(":")
     if name == "file" and argument:
         return lambda view: paste_picture(view.image, view.hole, read_image(argument), argument)
-    who = painter(spec, call)
-    return lambda view: _painted(who, view, call)
+    return partial(_painted, painter(spec, call), call)
 
 
-def _painted(who: Painter, view: Unfinished, call: Call) -> Appearance:
+def _painted(who: Painter, call: Call, view: Unfinished) -> Appearance:
     """The hole's surroundings, or the whole view, as a painter shows them without the object."""
     part = (slice(None), slice(None)) if who.whole else window_round_hole(view.hole)
     image, hole = view.image[part], view.hole[part]
@@ -107,3 +97,69 @@ def _painted(who: Painter, view: Unfinished, call: Call) -> Appearance:
     whole = view.image.copy()
     whole[part] = done.image
     return replace(done, image=whole)
+
+
+def without_specks(provider: Provider, view: Unfinished) -> Appearance:
+    """Parts of the hole of a few pixels are interpolated; the provider fills the rest."""
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(view.hole.astype(np.uint8), connectivity=8)
+    specks = view.hole & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
+    if not specks.any():
+        return provider(view)
+    image, rest = np.where(specks[..., None], interpolated(view.image, view.hole), view.image), view.hole & ~specks
+    if not rest.any():
+        return Appearance(image, 1.0, "a hole of a few pixels: interpolated")
+    return provider(replace(view, image=image, hole=rest))
+
+
+def exemplar(view: Unfinished) -> Appearance:
+    """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
+    near = window_round_hole(view.hole)
+    unknown = None if view.unknown is None else view.unknown[near]
+    settings = ExemplarSettings(PATCHES[view.variant % len(PATCHES)], seed=view.seed + view.variant)
+    done = complete_picture(view.image[near], view.hole[near], settings, unknown)
+    if np.isnan(done.misfit):
+        image = interpolated(view.image, view.hole)
+        return Appearance(image, 0.1, "no patch of the reference lies off the hole: interpolated")
+    confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    whole = view.image.copy()
+    whole[near] = done.image
+    words = f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels"
+    return Appearance(whole, confidence, words)
+
+
+def _interpolated(name: str, method: int, view: Unfinished) -> Appearance:
+    return Appearance(interpolated(view.image, view.hole, method), 0.3, f"interpolated by {name}")
+
+
+def _xphoto(name: str, method: str, there: int, back: int, view: Unfinished) -> Appearance:
+    """One of the methods of OpenCV's xphoto, whose mask marks what is known."""
+    if not hasattr(cv2, "xphoto"):
+        raise BadInput(f"--inpaint {name} needs OpenCV's contrib modules (opencv-contrib-python-headless)")
+    colours = cv2.cvtColor(view.image, there)
+    filled = np.zeros_like(colours)
+    cv2.setRNGSeed(view.seed)
+    cv2.xphoto.inpaint(colours, (~view.hole).astype(np.uint8) * 255, filled, getattr(cv2.xphoto, method))
+    return Appearance(cv2.cvtColor(filled, back), 0.5, f"filled by {name}")
+
+
+Provider = Callable[[Unfinished], Appearance]
+PROVIDERS: dict[str, Provider] = {
+    "exemplar": exemplar,
+    "telea": partial(_interpolated, "telea", cv2.INPAINT_TELEA),  # fast marching (Telea 2004)
+    "ns": partial(_interpolated, "ns", cv2.INPAINT_NS),  # isophotes continued (Bertalmio 2001)
+    # shift maps (Pritch 2009), which compare Lab colours; and frequency-selective reconstruction (Genser 2018)
+    "shiftmap": partial(_xphoto, "shiftmap", "INPAINT_SHIFTMAP", cv2.COLOR_RGB2Lab, cv2.COLOR_Lab2RGB),
+    "fsr": partial(_xphoto, "fsr", "INPAINT_FSR_FAST", cv2.COLOR_RGB2BGR, cv2.COLOR_BGR2RGB),
+}
+PAINTERS: dict[str, Callable[[str, Call], Painter]] = {
+    "onnx": networks.onnx_painter,
+    "torchscript": networks.torch_painter,
+    "gemini": gemini.painter,
+    "http": lambda rest, call: servers.painter(f"http:{rest}", call),
+    "https": lambda rest, call: servers.painter(f"https:{rest}", call),
+    "command": command_painter,
+}
+WITHOUT_ARGUMENT = ("gemini",)  # they may have one
+CHOICES = ", ".join(
+    [*PROVIDERS, "file:PATH", "onnx:PATH", "torchscript:PATH", "gemini[:MODEL]", "http://HOST:PORT or command:CMD"]
+)

@@ -11,24 +11,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
+from typing import Any
 
 import cv2
 import numpy as np
 
-from ..errors import BadInput
+from ..errors import BadInput, refusing
 from ..files import require_file
 from ..io.images import decoded
 from ..solvers.robust import robust_fit
-from . import command, onnx, torchscript
-from .calls import Call, one_line, waited
-from .networks import IMAGENET_MEAN, IMAGENET_STD, as_depth, path_and_size
-from .pasting import scaled
+from . import networks
+from .calls import Call, ask_command, split_command
 
 KINDS = ("disparity", "depth", "metric")
 FREE_SIZE = (518, 518)  # (width, height) for models that take any size: 37 patches of 14 px, as Depth Anything
 # what NumPy raises for a file whose header is read as Python is
 NO_ARRAY = (EOFError, OSError, OverflowError, SyntaxError, TokenError, TypeError, ValueError)
-LOOKING = ("onnx", "torchscript", "command")  # providers that look at a picture of the view
+NETWORKS: dict[str, Callable[[str, Path], networks.OnnxModel | networks.TorchModel]] = {
+    "onnx": networks.read_onnx,
+    "torchscript": networks.read_torch,
+}
+LOOKING = (*NETWORKS, "command")  # providers that look at a picture of the view
 USAGE = (
     "use auto, harmonic, planar, file:PATH, onnx:PATH, torchscript:PATH or command:CMD, followed by ,disparity ,depth "
     "or ,metric"
@@ -62,26 +65,18 @@ def depth_prior(
     the view, squeezed to the size that the model declares (else the one given after its path, else 518×518) and
     normalised by ImageNet's mean and deviation; its first output of two long axes is resized back. A command gets
     {image} and writes such a file: {out}, a PNG, or {npy}.
-
-    Raises
-    ------
-    BadInput
-        If the provider is unknown or its file, model or program cannot be used.
+    Raises BadInput if the provider is unknown or its file, model or program cannot be used.
     """
     provider = _provider(spec, call)
     if provider is None:
         return None
-    look, kind, of_depth = provider
+    look, kind = provider
     if image is None and looks(spec):
         raise BadInput(f"{call.option} {spec.partition(':')[0]}: there is no picture to look at")
     values = look(image, height, width)
-    if of_depth:
-        values = np.where(values == 0, np.nan, values)
     if not np.isfinite(values).any():
         raise BadInput(f"{call.option}: {spec.partition(':')[2]} gives no finite value")
-    if values.shape != (height, width):
-        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
-    return DepthPrior(values.astype(np.float32), kind)
+    return DepthPrior(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32), kind)
 
 
 def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) -> None:
@@ -89,31 +84,37 @@ def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) ->
     _provider(spec, call)
 
 
-Look = Callable[[np.ndarray | None, int, int], np.ndarray]  # (picture, height, width) → [h, w] float32
+Look = Callable[[Any, int, int], np.ndarray]  # (picture or None, height, width) → [h, w] float32
 
 
-def _provider(spec: str, call: Call) -> tuple[Look, str, bool] | None:
-    """Who looks, what its numbers are, and whether 0 stands for no value."""
+def _provider(spec: str, call: Call) -> tuple[Look, str] | None:
+    """Who looks, and what its numbers are."""
     name, _, rest = spec.partition(":")
     if spec in ("auto", "harmonic", "planar"):
         return None
     if name not in ("file", *LOOKING) or (name != "file" and not rest):
         raise BadInput(f"{call.option}: unknown provider {spec!r}; {USAGE}")
-    size = None
-    if name in ("onnx", "torchscript"):
-        path, size = path_and_size(rest, f"{call.option} {name}")
-        rest = str(path)
+    who, size = f"{call.option} {name}", None
+    if name in NETWORKS:
+        rest, size = networks.path_and_size(rest, who)
     before, _, kind = rest.rpartition(",")
     if kind not in KINDS:
         before, kind = rest, "disparity"
     if name == "file":
-        return lambda _, h, w: _from_file(Path(before), h, w), kind, kind != "disparity"
-    if name == "command":
-        return _by_command(before, call), kind, kind != "disparity"
-    if name == "torchscript":
-        return _by_network(torchscript.read_model(f"{call.option} {name}", Path(before)), size, call), kind, False
-    model = onnx.read_model(f"{call.option} {name}", Path(before))
-    return _by_network(model, model.size(model.picture) or size, call), kind, False
+        return lambda _, h, w: _from_file(Path(before), kind, h, w), kind
+    if name in NETWORKS:
+        model = NETWORKS[name](who, Path(before))
+        size = model.size or size or FREE_SIZE
+        return lambda image, h, w: networks.look(model, size, image, call), kind
+    words = split_command(before, call.option, ("{image}", "{out}"), ("{out}", "{npy}"))
+    wrong, answers = "wrote neither {out} nor {npy}", ("npy.npy", "out.png")
+
+    def look(image: np.ndarray, height: int, width: int) -> np.ndarray:
+        return ask_command(
+            words, {"image": image}, answers, wrong, call, lambda path: _from_file(path, kind, height, width)
+        )
+
+    return look, kind
 
 
 def relative_disparity(
@@ -153,47 +154,18 @@ def _affine(m: np.ndarray, disparity: np.ndarray) -> tuple[float, float]:
     return float(a / spread), float(b - a * middle / spread)
 
 
-def _from_file(path: Path, height: int, width: int) -> np.ndarray:
-    try:
+def _from_file(path: Path, kind: str, height: int, width: int) -> np.ndarray:
+    """A file's numbers of that kind, for a view of that shape; NaN where depth is 0."""
+    with refusing(f"--depth-prior: cannot read {path}", *NO_ARRAY):
         if path.suffix == ".npy":
             values = np.load(require_file(path), allow_pickle=False)
         else:
             data = require_file(path).read_bytes()
             values = decoded(data, f"--depth-prior: {path}", cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
         values = np.asarray(values, np.float32)
-    except NO_ARRAY as error:
-        raise BadInput(f"--depth-prior: cannot read {path} ({one_line(error)})") from None
     if values.ndim != 2 or values.size == 0:
         raise BadInput(f"--depth-prior: {path} is not a depth picture of one channel")
     if abs(values.shape[1] * height - values.shape[0] * width) > 1.5 * max(values.shape[0], height):
         size = f"{values.shape[1]}×{values.shape[0]}"
         raise BadInput(f"--depth-prior: {path} has {size} pixels, not the shape of the view ({width}×{height})")
-    return values
-
-
-def _by_command(text: str, call: Call) -> Look:
-    words = command.split(text, call.option, ("{image}", "{out}"), ("{out}", "{npy}"))
-
-    def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
-        assert image is not None
-        found, missing = ("npy.npy", "out.png"), "wrote neither {out} nor {npy}"
-        return command.asked(
-            words, {"image": image}, found, missing, call, lambda path: _from_file(path, height, width)
-        )
-
-    return look
-
-
-def _by_network(
-    model: onnx.OnnxModel | torchscript.TorchModel,
-    size: tuple[int, int] | None,  # width, height of what it is shown; None: any will do
-    call: Call,
-) -> Look:
-    def look(image: np.ndarray | None, height: int, width: int) -> np.ndarray:
-        assert image is not None
-        squeezed = scaled(image, *(size or FREE_SIZE)).astype(np.float32) / 255
-        blob = ((squeezed - IMAGENET_MEAN) / IMAGENET_STD).transpose(2, 0, 1)[None]
-        answers = waited(model.path.name, lambda: model.look(blob), call, lambda: "looks at the view")
-        return as_depth(answers, model.who)
-
-    return look
+    return values if kind == "disparity" else np.where(values == 0, np.nan, values)

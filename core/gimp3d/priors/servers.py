@@ -21,13 +21,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ..errors import BadInput
+from ..errors import BadInput, one_line, refusing
 from ..io.images import decode_image, encode_png
 from ..schema import parse_json, read_json
-from .appearance import Painter, Unfinished
-from .builtin import telea
-from .calls import Call, one_line, waited
-from .pasting import resized, scaled
+from .calls import Call, Painter, waited
+from .pasting import interpolated, resized, scaled
 
 SHORTEST, LONGEST = 512, 1024  # px of the sides that diffusion models paint well; the longest side decides
 MULTIPLE = 8  # px; their latents have one value for so many
@@ -39,7 +37,7 @@ PROGRESS = "/sdapi/v1/progress?skip_current_image=true"
 MOST_BYTES = 256 << 20  # of an answer
 NO_ANSWER = (AttributeError, LookupError, OverflowError, TypeError, ValueError)  # of JSON that says something else
 PROMPT = "photograph of the empty place, surfaces and textures of the surroundings continued, nothing standing there"
-Values = Mapping[str, Any]  # what a painter is told: prompt, negative, seed, strength, checkpoint
+Values = dict[str, Any]  # what a painter is told: prompt, negative, seed, strength, checkpoint
 NEGATIVE = "object, person, text, watermark, frame, blurry"
 
 
@@ -47,11 +45,7 @@ def painter(address: str, call: Call) -> Painter:
     """A server's address, and after a comma a ComfyUI workflow (.json, in API format) or a checkpoint's name.
 
     A server on this machine needs no leave; pictures go to others only where `call.allow_network`.
-
-    Raises
-    ------
-    BadInput
-        If the address is none, or is not allowed, or the workflow cannot be used.
+    Raises BadInput if the address is none, or is not allowed, or the workflow cannot be used.
     """
     url, _, more = address.partition(",")
     server = _Server(url, call)
@@ -62,11 +56,10 @@ def painter(address: str, call: Call) -> Painter:
         h, w = mask.shape
         width, height = painted_size(w, h)
         if call.strength == 1:
-            image = telea(Unfinished(image, mask)).image  # a trace of what stands there comes through
+            image = interpolated(image, mask)  # a trace of what stands there comes through
         shown, hole = scaled(image, width, height), scaled(mask.astype(np.uint8), width, height) > 0
-        words = f"{call.prompt}, {PROMPT}" if call.prompt else PROMPT
-        values = {"prompt": words, "negative": NEGATIVE, "seed": seed, "strength": call.strength}
-        values |= {"checkpoint": checkpoint}
+        values: Values = {"prompt": f"{call.prompt}, {PROMPT}" if call.prompt else PROMPT, "negative": NEGATIVE}
+        values |= {"seed": seed, "strength": call.strength, "checkpoint": checkpoint}
         work = _Comfy(server, workflow) if server.is_comfy() else _Automatic(server)
         if workflow and isinstance(work, _Automatic):
             raise BadInput(f"{server.option}: {url} is no ComfyUI; workflows are ComfyUI's, leave {more} away")
@@ -96,11 +89,9 @@ class _Server:
     """JSON and bytes over HTTP, with errors of one line."""
 
     def __init__(self, url: str, call: Call) -> None:
-        try:
+        with refusing(f"{call.option} http: {url!r} is no address", ValueError):
             parts = urllib.parse.urlsplit(url)
             host, port = parts.hostname, parts.port
-        except ValueError as error:
-            raise BadInput(f"{call.option} http: {url!r} is no address ({error})") from None
         self.option = f"{call.option} {parts.scheme}"
         if not host or parts.username is not None or parts.query or parts.fragment:
             shown = f"{parts.scheme}://{host}" if host else url  # without a password
@@ -111,20 +102,15 @@ class _Server:
             raise BadInput(
                 f"{self.option}: {host} is not this machine; pictures are sent there only with --allow-network"
             )
-        handlers: list[urllib.request.BaseHandler] = [_NoRedirect()]
-        if self.local:
-            handlers.append(urllib.request.ProxyHandler({}))
-        self._opener = urllib.request.build_opener(*handlers)
+        proxy = urllib.request.ProxyHandler({} if self.local else None)  # none, or the system's
+        self._opener = urllib.request.build_opener(_NoRedirect(), proxy)
 
     def is_comfy(self) -> bool:
         """Whether ComfyUI answers there; BadInput if neither it nor A1111 does."""
         for path, comfy in (("/system_stats", True), (PROGRESS, False)):
-            try:
+            with suppress(_NotThere):
                 self.get(path, QUICK * 5)
                 return comfy
-            except _Refused as refused:
-                if refused.code != 404:
-                    raise
         raise BadInput(
             f"{self.option}: {self.url} is neither ComfyUI nor a Stable Diffusion web UI with its API on "
             "(start it with --api)"
@@ -156,7 +142,8 @@ class _Server:
             with error:
                 said = _said(error.read(1 << 16))
             words = f"{self.option}: {self.url} refused ({error.code} {error.reason}): {said}"
-            raise _Refused(words, error.code) from None
+            kind_of_error = _NotThere if error.code == 404 else BadInput
+            raise kind_of_error(words) from None
         except (OSError, HTTPException) as error:
             reason = getattr(error, "reason", None) or error
             words = str(reason)[:200] or type(reason).__name__
@@ -175,10 +162,8 @@ class _Server:
         raise BadInput(f"{self.option}: cannot understand what {self.url} answered ({one_line(what)})")
 
 
-class _Refused(BadInput):
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
+class _NotThere(BadInput):
+    """A server that knows no such path."""
 
 
 def is_local(host: str) -> bool:
@@ -199,32 +184,29 @@ class _Comfy:
     stopped: bool = False
 
     def paint(self, image: np.ndarray, mask: np.ndarray, values: Values) -> bytes:
+        server, values = self.server, dict(values)
         try:
-            return self._paint({"image": image, "mask": mask}, dict(values))
+            for name, picture in (("image", image), ("mask", mask)):
+                data = encode_png(picture)
+                named = f"gimp3d-{hashlib.sha256(data).hexdigest()[:16]}.png"  # the same picture is not kept twice
+                answer = server.upload("/upload/image", named, data)
+                values[name] = "/".join(filter(None, (answer.get("subfolder", ""), answer.get("name", named))))
+            shipped = resources.files(__package__).joinpath("workflows/inpaint.json")
+            workflow = self.workflow or json.loads(shipped.read_text(encoding="utf-8"))
+            if "{checkpoint}" in json.dumps(workflow):
+                values["checkpoint"] = self._checkpoint(values["checkpoint"])
+            answer = server.post("/prompt", {"prompt": filled(workflow, values), "client_id": uuid.uuid4().hex})
+            if not isinstance(answer, dict) or "prompt_id" not in answer:
+                server.misunderstood(json.dumps(answer))
+            self.prompt_id = str(answer["prompt_id"])
+            while not self.stopped:
+                history = server.get(f"/history/{self.prompt_id}")
+                if self.prompt_id in history:
+                    return self._picture(history[self.prompt_id])
+                self.doing = "paints" if self._is_running() else "has others to paint first"
+                time.sleep(POLL)
         except NO_ANSWER as error:
-            self.server.misunderstood(f"{type(error).__name__}: {error}")
-
-    def _paint(self, pictures: Mapping[str, np.ndarray], values: dict[str, Any]) -> bytes:
-        server = self.server
-        for name, picture in pictures.items():
-            data = encode_png(picture)
-            named = f"gimp3d-{hashlib.sha256(data).hexdigest()[:16]}.png"  # the same picture is not kept twice
-            answer = server.upload("/upload/image", named, data)
-            values[name] = "/".join(filter(None, (answer.get("subfolder", ""), answer.get("name", named))))
-        shipped = resources.files(__package__).joinpath("workflows/inpaint.json")
-        workflow = self.workflow or json.loads(shipped.read_text(encoding="utf-8"))
-        if "{checkpoint}" in json.dumps(workflow):
-            values["checkpoint"] = self._checkpoint(values["checkpoint"])
-        answer = server.post("/prompt", {"prompt": filled(workflow, values), "client_id": uuid.uuid4().hex})
-        if not isinstance(answer, dict) or "prompt_id" not in answer:
-            server.misunderstood(json.dumps(answer))
-        self.prompt_id = str(answer["prompt_id"])
-        while not self.stopped:
-            history = server.get(f"/history/{self.prompt_id}")
-            if self.prompt_id in history:
-                return self._picture(history[self.prompt_id])
-            self.doing = "paints" if self._is_running() else "has others to paint first"
-            time.sleep(POLL)
+            server.misunderstood(f"{type(error).__name__}: {error}")
         raise BadInput(f"{server.option}: stopped")  # nobody waits for it any longer
 
     def _checkpoint(self, wanted: str) -> str:

@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
-from ..priors.appearance import Painter, window_round_hole
-from ..priors.calls import Call
-from ..priors.pasting import paste_picture, resized, scaled
+from ..priors.calls import Call, Painter
+from ..priors.pasting import paste_picture, resized, scaled, window_round_hole
 from .propagate import Rule
 
 KEPT = (Rule.UNTOUCHED, Rule.UNREACHED, Rule.EVIDENCE)  # pixels that nobody is asked about: known, or without a colour

@@ -14,12 +14,10 @@ from ..camera import Camera
 from ..errors import BadInput
 from ..geometry import colours_at, disparity_of, sees
 from ..presets import RemovalSettings
-from ..priors.appearance import Appearance
-from ..priors.builtin import PROVIDERS
 from ..priors.calls import Call
-from ..priors.inpaint import inpaint_reference
+from ..priors.inpaint import PROVIDERS, inpaint_reference
 from ..priors.monodepth import depth_prior, looks
-from ..priors.pasting import paste_picture
+from ..priors.pasting import Appearance, paste_picture
 from ..stages.charts import CHART, Chart, chart_number
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.propagate import Reference

@@ -21,8 +21,7 @@ from gimp3d.priors.monodepth import (
     looks,
     relative_disparity,
 )
-from gimp3d.priors.networks import IMAGENET_MEAN, IMAGENET_STD
-from gimp3d.priors.onnx import read_model
+from gimp3d.priors.networks import IMAGENET_MEAN, IMAGENET_STD, read_onnx
 
 
 def array_file(header: str) -> bytes:
@@ -155,8 +154,7 @@ def test_a_model_sees_the_normalised_picture_in_its_own_size(tmp_path, height, w
     assert found.kind == (kind[1:] or "disparity") and found.values.shape == (90, 120)
     wanted = answer(image)
     assert np.abs(found.values - wanted)[3:-3, 3:-3].mean() < 0.02 * np.ptp(wanted)
-    declared = read_model("--depth-prior", path)
-    assert declared.size(declared.picture) == (None if height == "h" else size)
+    assert read_onnx("--depth-prior", path).size == (None if height == "h" else size)
 
 
 def scripted(folder, body):

@@ -12,7 +12,7 @@ from pictures import disc, holed, inner, refuse, scenery
 
 from gimp3d.errors import BadInput
 from gimp3d.priors.inpaint import inpaint_reference
-from gimp3d.priors.onnx import onnx_runtime, read_model
+from gimp3d.priors.networks import onnx_runtime, read_onnx
 
 
 @pytest.fixture(params=["OpenCV", "ONNX Runtime"])
@@ -120,12 +120,12 @@ def test_models_with_absurd_channels_are_refused(tmp_path: Path, channels: int) 
 def test_a_negative_length_means_any(tmp_path: Path) -> None:
     minus_one = (1 << 64) - 1  # as protocol buffers write it
     (tmp_path / "m.onnx").write_bytes(painter_of_four_channels((minus_one, minus_one)))
-    found = read_model("--inpaint onnx", tmp_path / "m.onnx")
-    assert found.inputs == {"x": (1, 4, 0, 0)} and found.size("x") is None
+    found = read_onnx("--inpaint onnx", tmp_path / "m.onnx")
+    assert found.inputs == {"x": (1, 4, 0, 0)} and found.size is None
 
 
 @pytest.mark.parametrize("data", [b"\xff" * 4000, field(7, b"\x80" * 4000), varint(7 << 3 | 2) + b"\xff" * 9 + b"\x01"])
 def test_numbers_without_an_end_are_refused(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "m.onnx").write_bytes(data)
     with pytest.raises(BadInput, match="not an ONNX model"):
-        read_model("--inpaint onnx", tmp_path / "m.onnx")
+        read_onnx("--inpaint onnx", tmp_path / "m.onnx")

@@ -38,7 +38,7 @@ def test_what_stood_in_the_hole_does_not_matter(lama: Path) -> None:
 
 
 def test_large_pictures_are_reduced(lama: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gimp3d.priors.torchscript.LONGEST_SIDE", 64)
+    monkeypatch.setattr("gimp3d.priors.networks.LONGEST_SIDE", 64)
     picture, hole = scenery(), disc()
     done = inpaint_reference(f"torchscript:{lama}", holed(picture, hole), hole)
     assert np.abs(done.image[inner(hole, 6)].astype(int) - COLOUR).max() <= 2

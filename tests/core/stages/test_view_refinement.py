@@ -10,8 +10,8 @@ import pytest
 from pictures import disc, error, scenery
 
 from gimp3d.errors import BadInput
-from gimp3d.priors.appearance import Painter, window_round_hole
-from gimp3d.priors.calls import Call
+from gimp3d.priors.calls import Call, Painter
+from gimp3d.priors.pasting import window_round_hole
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
 from gimp3d.store import StageStore
