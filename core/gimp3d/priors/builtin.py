@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
-from ..solvers.exemplar import ExemplarSettings, complete_picture
+from ..solvers.exemplar import complete_picture
 from ..solvers.patchmatch import nearest_allowed
 from .appearance import Appearance, Provider, Unfinished, window_round_hole
 
@@ -36,8 +36,8 @@ def exemplar(view: Unfinished) -> Appearance:
     """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
     near = window_round_hole(view.hole)
     unknown = None if view.unknown is None else view.unknown[near]
-    settings = ExemplarSettings(PATCHES[view.variant % len(PATCHES)], seed=view.seed + view.variant)
-    done = complete_picture(view.image[near], view.hole[near], settings, unknown)
+    patch = PATCHES[view.variant % len(PATCHES)]
+    done = complete_picture(view.image[near], view.hole[near], patch, view.seed + view.variant, unknown)
     if np.isnan(done.misfit):
         return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
     confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))

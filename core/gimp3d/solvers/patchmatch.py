@@ -21,8 +21,7 @@ from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import any_between, fma16, load1, load16, splat16, store16, sum16
 from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
-from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
-from .patches import Patches, coordinates, lay_out
+from .patches import NO_TREE, Patches, PatchIndex, coordinates, index_patches, lay_out, leaf_of
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
@@ -87,14 +86,18 @@ def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
     return cv2.erode(usable.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def upsampled(field: NearestNeighbourField, target: np.ndarray) -> NearestNeighbourField:
-    """The field at twice the resolution, that of `target`: f ← 2·f plus the pixel's parity; its cost is not known
-    yet."""
+def upsampled(field: NearestNeighbourField, target: np.ndarray, allowed: np.ndarray) -> NearestNeighbourField:
+    """The field at twice the resolution, that of `target`: f ← 2·f plus the pixel's parity, where that is allowed.
+
+    Its cost is not known yet.
+    """
     h, w = target.shape
-    y, x = np.nonzero(target & (field.rows.repeat(2, 0).repeat(2, 1)[:h, :w] >= 0))
+    y, x = np.nonzero(target & field.found.repeat(2, 0).repeat(2, 1)[:h, :w])
+    v = np.minimum(2 * field.rows[y // 2, x // 2] + (y & 1), h - 1)
+    u = np.minimum(2 * field.cols[y // 2, x // 2] + (x & 1), w - 1)
+    kept = allowed[v, u]
     rows, cols = np.full((2, h, w), -1, np.int32)
-    rows[y, x] = np.minimum(2 * field.rows[y // 2, x // 2] + (y & 1), h - 1)
-    cols[y, x] = np.minimum(2 * field.cols[y // 2, x // 2] + (x & 1), w - 1)
+    rows[y[kept], x[kept]], cols[y[kept], x[kept]] = v[kept], u[kept]
     return NearestNeighbourField(rows, cols, np.zeros((h, w), np.float32), field.radius)
 
 
@@ -105,9 +108,8 @@ def refined(
     allowed: np.ndarray,  # [H, W] bool, source patch centres
     settings: PatchMatchSettings,
     penalty: np.ndarray | None = None,  # [H, W] float32
-    index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
+    index: PatchIndex | None = None,  # of allowed patches
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
-    reach: int = REACH,  # px, of the random search
     tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
@@ -134,7 +136,7 @@ def refined(
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
             *tree, index is not None and sweep < tree_sweeps, looks, number,
-            *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
+            *start, sweep == 0, sweep % 2 == 0, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
         parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
@@ -179,7 +181,7 @@ def _sweep_band(
     target, allowed, values, stride, channels, radius, row_weights, penalty,
     weight, coherence, truncation, tie, guides,
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
-    start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost, band,
+    start_rows, start_cols, first, downward, random, old_rows, old_cols, rows, cols, cost, band,
 ):  # fmt: skip
     """One sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones
     near.
@@ -206,7 +208,7 @@ def _sweep_band(
                 v, u = int64(rows[y, x]), int64(cols[y, x])
             state = _hash(uint32(y * w + x) ^ salt)
             best, own = float32(1e30), float32(0)
-            turn, block, lane, span = 0, 0, 16, reach
+            turn, block, lane, span = 0, 0, 16, REACH
             while True:
                 bound = float32(0)
                 if turn == 0:

@@ -7,14 +7,14 @@ import pytest
 from structured import edge_error, structured
 
 from gimp3d.evaluate.metrics import psnr
-from gimp3d.solvers.exemplar import ExemplarSettings, complete_picture
+from gimp3d.solvers.exemplar import complete_picture
 
 PICTURES = structured()
 
 
 def filled(name: str, seed: int = 0) -> np.ndarray:
     truth, hole = PICTURES[name]
-    return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, ExemplarSettings(seed=seed)).image
+    return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, seed=seed).image
 
 
 @pytest.mark.parametrize("name", [name for name in PICTURES if name != "rug"])
