@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
+from ..geometry import bounds
+from .regularity import pattern_search
 
 SIDE = 192  # px: pictures are shrunk to this to look for edges
 ANGLE = 2.0  # degrees between directions that are tried
@@ -67,9 +69,7 @@ def find_edges(
 
 
 def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
-    rows, cols = np.nonzero(hole)
-    far = FURTHEST * REACH
-    near = np.s_[max(0, rows.min() - far) : rows.max() + far + 1, max(0, cols.min() - far) : cols.max() + far + 1]
+    near = bounds(hole, FURTHEST * REACH)
     corner = np.array([near[1].start, near[0].start])
     picture, hole, known = picture[near], hole[near], known[near]
     scale = min(1.0, SIDE / max(hole.shape))
@@ -186,49 +186,35 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
     counts = sums[..., 0]
     first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
     last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
-    sides = []
-    for lo, hi in ((np.maximum(first, begins - far), begins), (ends, np.minimum(last, ends + far))):
-        whole = np.zeros((side, 7))
-        whole[rows] = sums[number, hi] - sums[number, lo]
-        sides.append(whole)
-    pairs = [(_above(s), _below(s)) for s in sides]
+    whole = np.zeros((2, side, 7))  # of the two sides
+    whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - far)]
+    whole[1, rows] = sums[number, np.minimum(last, ends + far)] - sums[number, ends]
+    pairs = np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1)
     both, *halves = (_told(told, 2 * LEAST * scale) for told in (pairs, pairs[:1], pairs[1:]))
     return np.stack([both, *(np.where(half >= HALF_TELLS, half, 0.0) for half in halves)])
 
 
-def _above(rows: np.ndarray) -> np.ndarray:
-    return np.roll(rows, 1, 0) + np.roll(rows, 2, 0)
+def _told(sums: np.ndarray, least: float) -> np.ndarray:
+    """[N]: steps between two rows above and two below, 0 for none.
 
-
-def _below(rows: np.ndarray) -> np.ndarray:
-    return np.roll(rows, -1, 0) + np.roll(rows, -2, 0)
-
-
-def _told(sides: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> np.ndarray:
-    """[N]: steps between two rows above and two below, of sums [N, 7]: pixels, colours, their squares; 0 for none."""
-    steps, told, enough = [], np.full(len(sides[0][0]), np.inf), np.full(len(sides[0][0]), True)
+    `sums` are [sides, 2 (above, below), N, 7]: pixels, colours, their squares; there are at least so many pixels.
+    """
+    pixels = sums[..., :1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        for pair in sides:
-            means, noise = [], np.zeros(len(told))
-            for sums in pair:
-                pixels = sums[:, :1]
-                means.append(sums[:, 1:4] / pixels)
-                spread = np.maximum((sums[:, 4:] / pixels - means[-1] ** 2).sum(1), 1.0)
-                noise = noise + CLUMPED * spread / pixels[:, 0]
-                enough = enough & (pixels[:, 0] >= least)
-            steps.append(means[1] - means[0])
-            size = np.linalg.norm(steps[-1], axis=1)
-            told = np.minimum(told, np.where(size >= STEEP, size / np.sqrt(noise), 0))
-        alike = (steps[0] * steps[-1]).sum(1) > LIKE * np.prod(
-            [np.linalg.norm(s, axis=1) for s in (steps[0], steps[-1])], axis=0
-        )
-    return np.where(enough & alike & (told >= TELLS), told, 0.0)
+        means = sums[..., 1:4] / pixels
+        spread = np.maximum((sums[..., 4:] / pixels - means**2).sum(-1), 1.0)
+        noise = (CLUMPED * spread / pixels[..., 0]).sum(1, dtype=np.float64)
+        steps = means[:, 1] - means[:, 0]
+        size = np.linalg.norm(steps, axis=-1)
+        told = np.where(size >= STEEP, size / np.sqrt(noise), 0).min(0)
+        alike = (steps[0] * steps[-1]).sum(-1) > LIKE * (size[0] * size[-1])
+    return np.where((pixels >= least).all((0, 1, 3)) & alike & (told >= TELLS), told, 0.0)
 
 
 def _settled(
     picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray, side: int
 ) -> Edge | _Half | None:
-    """The edge at full resolution: turned and shifted to where it is told best (pattern search: Hooke 1961)."""
+    """The edge at full resolution: turned and shifted to where it is told best."""
     rows, cols = np.nonzero(hole)
     pixels = np.stack([cols, rows], 1).astype(np.float64)
     shows = known.astype(np.float32)
@@ -249,18 +235,17 @@ def _settled(
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             sums = np.concatenate([np.ones_like(colours[..., :1]), colours, colours**2], -1) * there
             near = sums * (there.cumsum(1) <= REACH)
-            pair = tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW))
             if side not in (BOTH, BEFORE + number):
                 beyond = near
                 ends.append(start)
                 continue
             told_by = near
-            sides.append(pair)
+            sides.append([near[rows].sum((0, 1)) for rows in (ABOVE, BELOW)])
             steady = steady and _is_edge(near) and (side == BOTH or _is_border(near))
             ends.append(float(t[_length(sums, _step(near))]))
-        told = float(_told(sides, 2 * LEAST)[0])
-        means = [[s[0, 1:4] / max(s[0, 0], 1) for s in pair] for pair in sides]
-        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), np.mean(means, (0, 1)))
+        pairs = np.array(sides)
+        told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
+        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
         if not steady or side == BOTH:
             return told, edge if steady else None
         inwards = 1 if side == BEFORE else -1
@@ -270,16 +255,11 @@ def _settled(
         dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
         return told, _Half(edge, enters, leaves, bool(dark))
 
-    values, step = np.zeros(2), 1.0
-    best = at(values)
-    while step > 0.1:
-        tried = [(at(m), m) for m in (values + step * s * np.eye(2)[k] for k in range(2) for s in (1, -1))]
-        (score, edge), move = max(tried, key=lambda t: t[0][0])
-        if score > best[0]:
-            best, values = (score, edge), move
-        else:
-            step /= 2
-    return best[1] if best[0] > 0 else None
+    def score(values: np.ndarray) -> float:
+        return at(values)[0]
+
+    values, best = pattern_search(score, np.eye(2))
+    return at(values)[1] if best > 0 else None
 
 
 def _mean(sums: np.ndarray) -> np.ndarray:

@@ -56,16 +56,14 @@ def solve_poisson(
     the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
     """
     hole = np.asarray(hole, bool)
-    if not hole.any():
-        filled = np.array(values, dtype=np.float64)
-        return PoissonSolution(filled[hole] if only_hole else filled, 0, np.zeros(0 if only_hole else hole.shape, bool))
     window = bounds(hole, 1)
 
     def cut(array: np.ndarray) -> np.ndarray:
         part = np.pad(np.asarray(array)[window], ((1, 1), (1, 1), *[(0, 0)] * (np.ndim(array) - 2)))
         return part if part.dtype == bool else part.astype(np.float64).reshape(*part.shape[:2], -1)
 
-    fixed, guide = cut(values), None if guidance is None else cut(guidance)
+    fixed = cut(values)
+    guide = np.full(fixed.shape, np.nan) if guidance is None else cut(guidance)
     aim = np.zeros(fixed.shape) if anchor is None else cut(anchor)
     pull = np.zeros(fixed.shape[:2]) if weight is None else cut(weight)[..., 0]
     pull[~((pull > LEAST_WEIGHT) & np.isfinite(pull) & np.isfinite(aim).all(-1))] = 0
@@ -86,15 +84,15 @@ class _Task(NamedTuple):
     hole: np.ndarray  # [h, w] bool
     known: np.ndarray  # [h, w] bool
     values: np.ndarray  # [h, w, C]
-    guidance: np.ndarray | None  # [h, w, C]
+    guidance: np.ndarray  # [h, w, C], NaN where there is none
     pull: np.ndarray  # [h, w]
     anchor: np.ndarray  # [h, w, C]
 
 
 def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
     """[h, w, C] of the hole, the iterations taken, and what is unanchored [h, w] bool."""
-    hole, known = task.hole, task.known & ~task.hole & np.isfinite(task.values).all(-1)
-    given = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
+    hole, given = task.hole, task.guidance
+    known = task.known & ~hole & np.isfinite(task.values).all(-1)
     guided, values = np.isfinite(given), np.where(known[..., None], task.values, 0)
     # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for.
     start = np.where(guided & hole[..., None], given, 0)
@@ -136,13 +134,13 @@ def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
 
 def _settled(task: _Task, loose: np.ndarray, parts: np.ndarray, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
     """Unanchored parts take their guidance, the rest is solved; pixels without guidance hang on those with."""
-    guidance = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
-    taken = loose & np.isfinite(guidance).all(-1)
+    taken = loose & np.isfinite(task.guidance).all(-1)
     lost = loose & (np.bincount(parts.ravel(), taken.ravel()) == 0)[parts]
-    values = np.where(taken[..., None], guidance, task.values)
+    values = np.where(taken[..., None], task.guidance, task.values)
     hole, known = task.hole & ~taken & ~lost, (task.known & ~loose) | taken
     result, iterations, _ = _solve(task._replace(hole=hole, known=known, values=values), tolerance)
-    return np.where(taken[..., None], guidance, np.where(lost[..., None], np.nan, result)), iterations, loose
+    result[taken], result[lost] = task.guidance[taken], np.nan
+    return result, iterations, loose
 
 
 class _Grid(NamedTuple):

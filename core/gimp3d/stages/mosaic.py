@@ -77,26 +77,20 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 def _agree_range(lo, hi, samples, textures, density, middle, spread, loud):
     values = np.empty(len(samples))
     for i in range(lo, hi):
-        count = 0
-        for channel in range(3):
+        for channel in range(4):  # the fourth is texture
             count = 0
             for k in range(len(samples)):
                 if density[k, i] > 0:
-                    values[count] = samples[k, i, channel]
+                    values[count] = samples[k, i, channel] if channel < 3 else textures[k, i]
                     count += 1
-            if count:
-                part = np.sort(values[:count])
+            if count == 0:
+                break
+            part = np.sort(values[:count])
+            if channel < 3:
                 middle[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
-        if count == 0:
-            continue
-        count = 0
-        for k in range(len(samples)):
-            if density[k, i] > 0:
-                values[count] = textures[k, i]
-                count += 1
-        part = np.sort(values[:count])
-        loud[i] = 0.5 * abs(part[count // 2])
-        spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
+            else:
+                loud[i] = 0.5 * abs(part[count // 2])
+                spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
 
 
 @exact_kernel
