@@ -37,13 +37,13 @@ def exemplar(view: Unfinished) -> Appearance:
     near = window_round_hole(view.hole)
     unknown = None if view.unknown is None else view.unknown[near]
     patch = PATCHES[view.variant % len(PATCHES)]
-    done = complete_picture(view.image[near], view.hole[near], patch, view.seed + view.variant, unknown)
-    if np.isnan(done.misfit):
+    filled, misfit = complete_picture(view.image[near], view.hole[near], patch, view.seed + view.variant, unknown)
+    if np.isnan(misfit):
         return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
-    confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    confidence = 0.7 * float(np.exp(-misfit / CONFIDENCE_SCALE))
     whole = view.image.copy()
-    whole[near] = done.image
-    words = f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels"
+    whole[near] = filled
+    words = f"filled with the view's own texture, which fits to {misfit:.1f} grey levels"
     return Appearance(whole, confidence, words)
 
 

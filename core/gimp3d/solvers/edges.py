@@ -53,12 +53,11 @@ class Edge:
     mean: np.ndarray  # [3] grey levels, of what lies to its left and right
 
 
-def find_edges(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool, what the picture shows well
-) -> tuple[Edge, ...]:
-    """The edges that run into each part of the hole on one side and go on, with the same colours, on the other."""
+def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[Edge, ...]:
+    """The edges that run into each part of a picture's hole on one side and go on, alike, on the other.
+
+    The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool.
+    """
     count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     picture = image.astype(np.float32)
     found: list[Edge] = []
@@ -82,8 +81,7 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
     heart = (told.shape[2] - 1) / 2
     middle = (np.array(size) - 1) / 2
     places = np.argwhere(open_)[:, ::-1] - middle
-    whole: list[Edge] = []
-    halves: list[_Half] = []
+    found: list[Edge | _Half] = []
     for number in range(2 * MOST):
         sides = slice(BOTH, BOTH + 1) if number < MOST and told[:, BOTH].any() else slice(BEFORE, AFTER + 1)
         k, side, row = (int(n) for n in np.unravel_index(told[:, sides].argmax(), told[:, sides].shape))
@@ -97,10 +95,8 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
         if cut.max() - cut.min() >= LEAST_CUT * scale:
             place = ((offset * across + middle) + 0.5) / scale - 0.5
             edge = _settled(picture, known, hole, angles[k], place, side)
-        if isinstance(edge, Edge):
-            whole.append(edge)
-        elif edge is not None:
-            halves.append(edge)
+        if edge is not None:
+            found.append(edge)
         ways = (cut.min(), along), (cut.max(), -along)
         for end, inwards in (ways, ways[:1], ways[1:])[side]:
             place = offset * across + end * along
@@ -109,7 +105,9 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
                 beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
                 here = BEFORE if inwards @ axes[0] > 0 else AFTER
                 told[other, [[BOTH], [here if edge is not None or side != BOTH else BOTH]], beside] = 0
-    return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *_joined(halves, hole)]]
+    whole = [edge for edge in found if isinstance(edge, Edge)]
+    halves = _joined([half for half in found if isinstance(half, _Half)], hole)
+    return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *halves]]
 
 
 @dataclass(frozen=True)
@@ -241,7 +239,7 @@ def _settled(
                 continue
             told_by = near
             sides.append([near[rows].sum((0, 1)) for rows in (ABOVE, BELOW)])
-            steady = steady and _is_edge(near) and (side == BOTH or _is_border(near))
+            steady = steady and _is_edge(near, border=side != BOTH)
             ends.append(float(t[_length(sums, _step(near))]))
         pairs = np.array(sides)
         told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
@@ -272,22 +270,19 @@ def _step(sums: np.ndarray, above: slice = ABOVE, below: slice = BELOW) -> np.nd
     return _mean(sums[below]) - _mean(sums[above])
 
 
-def _is_edge(sums: np.ndarray) -> bool:
-    """Whether colours step at once, and all along a line near the hole: further off it may end, as at a corner."""
+def _is_edge(sums: np.ndarray, border: bool) -> bool:
+    """Whether colours step at once, and all along a line near the hole: further off it may end, as at a corner.
+
+    As a border, it must part two regions: a thin line, or one of a texture's, has the same colours further off again.
+    """
     pixels = sums[..., 0].sum(0).cumsum()
     block = np.minimum((BLOCKS * pixels / max(pixels[-1], 1)).astype(int), BLOCKS - 1)
     whole = _step(sums)
     size = max(float(np.linalg.norm(whole)), 1e-9)
     each = np.array([_step(sums[:, block == k]) for k in range(BLOCKS)]) @ whole / size
-    sharp = size**2 >= SHARP * (_step(sums, FAR_ABOVE, FAR_BELOW) @ whole)
-    near = each[:CLOSEST]
-    return bool(sharp and near.min() >= STEADY * np.median(near))
-
-
-def _is_border(sums: np.ndarray) -> bool:
-    """Whether it parts two regions: a thin line, or one of a texture's, has the same colours further off again."""
-    whole = _step(sums)
-    return bool(_step(sums, FAR_ABOVE, FAR_BELOW) @ whole >= STEADY * (whole @ whole))
+    far, near = _step(sums, FAR_ABOVE, FAR_BELOW) @ whole, each[:CLOSEST]
+    parts = not border or far >= STEADY * (whole @ whole)
+    return bool(parts and size**2 >= SHARP * far and near.min() >= STEADY * np.median(near))
 
 
 def _goes_on(beyond: np.ndarray, told_by: np.ndarray) -> bool:
@@ -311,15 +306,11 @@ def _length(sums: np.ndarray, whole: np.ndarray) -> int:
     return last
 
 
-def guide_of(
-    edges: Sequence[Edge],
-    shape: tuple[int, int],
-    shrunk: float,  # times, the picture that the edges were found in
-    width: float,  # px, σ
-) -> np.ndarray:
+def guide_of(edges: Sequence[Edge], shape: tuple[int, ...], shrunk: float, width: float) -> np.ndarray:
     """[h, w, 8] float32 in [-1, 1]: how near to an edge a pixel lies, on which side, the edge's step and mean colour.
 
-    Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one, and past its ends.
+    Of the picture that the edges were found in, so many times shrunk. Two pixels of the same guide lie at the same
+    distance from edges of a kind; it is 0 far from one (`width` is σ, px), and past its ends.
     """
     h, w = shape
     x, y = (np.arange(n, dtype=np.float32) for n in (w, h))

@@ -47,29 +47,23 @@ EDGE = 0.15  # difference in colour that counts as much as being on an edge, or 
 GUIDE = np.array([EDGE, EDGE, *[1] * 6], np.float32)  # what differences of guide_of count: an edge's colours as others
 
 
-@dataclass(frozen=True)
-class Completion:
-    """A picture with its hole filled."""
-
-    image: np.ndarray  # [H, W, 3] uint8, outside the hole bit for bit the input
-    misfit: float  # RMS grey levels between pixels and their own patches' sources; NaN where none could be copied
-
-
 def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
     patch: int = PATCH,  # px, odd
     seed: int = 0,
     unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
-) -> Completion:
+) -> tuple[np.ndarray, float]:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
 
-    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges.
+    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges. What is unknown
+    near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
 
-    What is unknown near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
+    Returns the picture [H, W, 3] uint8, outside the hole bit for bit the input, and its misfit: RMS grey levels between
+    pixels and their own patches' sources; NaN where none could be copied.
     """
     if not hole.any():
-        return Completion(image.copy(), 0.0)
+        return image.copy(), 0.0
     asked, given = hole, image
     if unknown is None or (unknown | hole).all():
         unknown = np.zeros(hole.shape, bool)
@@ -79,12 +73,12 @@ def complete_picture(
     motions = find_motions(image, hole, known)
     image, regular = continue_regularly(image, hole, known, motions)
     if (regular == hole).all():
-        return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
+        return np.where(hole[..., None], image, given), max(m.misfit for m in motions)
     # where photos disagree a little, what they show tells edges all the same
     edges = find_edges(given, asked, ~asked & given.any(-1))
     done = _by_patches(image, hole & ~regular, unknown, edges, patch, seed)
     if done is None:
-        return Completion(given.copy(), float("nan"))
+        return given.copy(), float("nan")
     level, field, colours = done
     hole = level.hole
     sources = image[field.rows[hole], field.cols[hole]]
@@ -92,7 +86,7 @@ def complete_picture(
     filled = image.copy()
     filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
     filled[~asked] = given[~asked]  # what was filled besides
-    return Completion(filled, misfit)
+    return filled, misfit
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,7 @@ class _Level:
     touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
-    trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
+    trust: np.ndarray  # [touching pixels] float64 > 0, how well founded each of those patches is
     radius: int
 
 
@@ -164,7 +158,7 @@ def _filled(
     else:
         rounds, usual = 1, float(np.median(coarser.cost[coarser.found]))
         field = upsampled(coarser, level.touching, allowed)
-        colours = _voted(level, field, level.trust, level.channels[hole])
+        colours = _voted(level, field, level.channels[hole])
 
     def matched(
         field: NearestNeighbourField, colours: np.ndarray, number: int
@@ -177,7 +171,7 @@ def _filled(
         matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
         field = refined(field, patches, level.touching, allowed, matching, penalty, index, guided, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))
-        return field, _voted(level, field, _say(level, field), colours)
+        return field, _voted(level, field, colours)
 
     for number in range(rounds):
         field, voted = matched(field, colours, number)
@@ -200,13 +194,6 @@ def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     return shift_map(picture, level.hole, level.usable, field)
 
 
-def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
-    """[touching pixels] float64: the weight of each patch's vote."""
-    costs = field.cost[level.touching]
-    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
-    return level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
-
-
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
     """The hole's colours [N, 3] without seams: the gradients of what is copied, fixed at the rim.
 
@@ -218,10 +205,9 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     hole, corner = level.hole[box], np.array([b.start for b in box])
     picture = level.channels[box][..., :3].copy()
     picture[hole] = colours[:, :3]
-    say = _say(level, field)
     sources = _sources(level, field, colours)
     rim = dilated(hole, 1) & ~hole & level.usable[box]
-    said = _voted(level, field, say, picture[rim], np.argwhere(rim) + corner)
+    said = _voted(level, field, picture[rim], np.argwhere(rim) + corner)
     rim[rim] = np.abs(said - picture[rim]).max(1) < DISAGREEMENT
     slopes = []
     for dy, dx in ((0, 1), (1, 0)):
@@ -231,11 +217,11 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
         across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
         across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
         places = np.argwhere(across) + corner
-        voted = _voted(level, field, say, slope[across], places, (dy, dx))
+        voted = _voted(level, field, slope[across], places, (dy, dx))
         slope[across] = voted + COPIED * (_copied_steps(level, sources, places, (dy, dx)) - voted)
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
-    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture, only_hole=True).values
+    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values[hole]
 
 
 def _copied_steps(
@@ -310,14 +296,15 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _voted(
     level: _Level,
     field: NearestNeighbourField,
-    say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
     otherwise: np.ndarray,  # [N, C], where nothing is voted for
     places: np.ndarray | None = None,  # [N, 2] rows and columns; None: the hole's
     step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each pixel looks like, [N, C] float32."""
+    """What the overlapping patches say each pixel looks like, [N, C] float32; what fits badly has little say."""
     places = np.argwhere(level.hole) if places is None else places
-    weights = np.zeros(level.hole.shape)
+    costs, weights = field.cost[level.touching], np.zeros(level.hole.shape)
+    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
+    say = level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
     voted = otherwise.astype(np.float32)
     parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius

@@ -40,17 +40,15 @@ class Expected(NamedTuple):
         return Expected(*(cv2.blur(a, (patch,) * 2) for a in resized))
 
 
-def expect(
-    image: np.ndarray,  # [H, W, 3], colours in [0, 1]
-    hole: np.ndarray,  # [H, W] bool, some of it
-    known: np.ndarray,  # [H, W] bool, some of it
-) -> Expected:
-    """The picture at the size that tells the hole's: detail finer than `SIDE` allows is left out."""
+def expect(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> Expected:
+    """A picture [H, W, 3] in [0, 1] at the size that tells the hole's: detail finer than `SIDE` allows is left out.
+
+    Hole and what is known are [H, W] bool, some of it each.
+    """
     height, width = hole.shape
     thickness = 2 * float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
     reach = max(LEAST_GIVEN, GIVEN * thickness)
-    rows, cols = np.nonzero(hole)
-    longest = float(max(rows.max() - rows.min(), cols.max() - cols.min()))
+    longest = max(side.stop - side.start for side in bounds(hole)) - 1
     scale = min(1.0, SIDE / (longest + 2 * reach))
     size = max(2, round(width * scale)), max(2, round(height * scale))
     share, total, open_ = (
@@ -98,13 +96,11 @@ def _kriged(
     return ROUNDING * np.rint(found / ROUNDING), ROUNDING**2 * np.rint(variance / ROUNDING**2)
 
 
-def foretell(
-    picture: np.ndarray,  # [H, W, 3] float32
-    known: np.ndarray,  # [H, W] bool
-) -> tuple[np.ndarray, np.ndarray, Variogram]:
+def foretell(picture: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Variogram]:
     """The rim's colours carried inwards [H, W, 3], the variance of the true ones about them [H, W], and the variogram.
 
-    The variance at a distance from the rim is the rim's own semivariance at that lag.
+    The picture is [H, W, 3] float32, `known` [H, W] bool. At a distance from the rim, the variance is the rim's own
+    semivariance at that lag.
     """
     away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
     depth = float(away.max())
@@ -115,12 +111,8 @@ def foretell(
     return np.where(known[..., None], picture, carried(picture, rim)), variance, lags
 
 
-def variogram(
-    picture: np.ndarray,  # [H, W, C]
-    known: np.ndarray,  # [H, W] bool
-    reach: float,  # px
-) -> Variogram:
-    """Of known pixels; the semivariance never falls."""
+def variogram(picture: np.ndarray, known: np.ndarray, reach: float) -> Variogram:
+    """Of a picture's [H, W, C] known pixels [H, W] bool, to twice a reach in px; the semivariance never falls."""
     lags, found = [0.0], [0.0]
     (height, width), lag = known.shape, 1
     while lag < 2 * reach and lag < max(height, width):
@@ -141,11 +133,11 @@ def variogram(
     return lags, found
 
 
-def carried(
-    picture: np.ndarray,  # [H, W, 3] float32
-    known: np.ndarray,  # [H, W] bool
-) -> np.ndarray:
-    """Known colours, and coarser means of them where there are none (push-pull: Grossman 1998); float32."""
+def carried(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The known colours, [H, W] bool, of a picture [H, W, 3] float32, and coarser means of them where there are none.
+
+    Push-pull (Grossman 1998); float32.
+    """
     weight = known.astype(np.float32)
     levels = [(picture * weight[..., None], weight)]
     while max(levels[-1][1].shape) > 1:

@@ -133,15 +133,11 @@ _floats, _integers = np.empty(0, np.float32), np.empty(0, np.int32)
 NO_TREE = Tree(_floats, _integers, _integers, _integers, _floats, np.empty((0, 0), np.int32), 1)
 
 
-class PatchIndex(NamedTuple):
-    """A tree and the coordinates it is built on. Patches of any picture of the same radius can be looked up."""
+def index_patches(patches: Patches, allowed: np.ndarray, step: int) -> tuple[Components, Tree]:
+    """A tree of the patches `allowed` ([H, W] bool, centres) on a grid of every `step`-th row and column, or else all.
 
-    components: Components
-    tree: Tree
-
-
-def index_patches(patches: Patches, allowed: np.ndarray, step: int) -> PatchIndex:
-    """Index the patches `allowed` ([H, W] bool, centres) on a grid of every `step`-th row and column, or else all."""
+    Patches of any picture of the same radius can be looked up by their coordinates, as the components tell.
+    """
     if not allowed[::step, ::step].any():
         step = 1
     rows, cols = (a * step for a in np.nonzero(allowed[::step, ::step]))
@@ -163,7 +159,7 @@ def index_patches(patches: Patches, allowed: np.ndarray, step: int) -> PatchInde
     grid[rows[order] // step, cols[order] // step] = np.arange(len(order)) // LANES
     empty = np.full(count * LANES - len(order), -1)
     rows, cols = (np.concatenate([a[order], empty]).astype(np.int32) for a in (rows, cols))
-    return PatchIndex(components, Tree(features, rows, cols, split_component, split_value, grid, step))
+    return components, Tree(features, rows, cols, split_component, split_value, grid, step)
 
 
 @inline_kernel

@@ -21,7 +21,7 @@ from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import any_between, fma16, load1, load16, splat16, store16, sum16
 from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
-from .patches import NO_TREE, Patches, PatchIndex, coordinates, index_patches, lay_out, leaf_of
+from .patches import NO_TREE, Components, Patches, Tree, coordinates, index_patches, lay_out, leaf_of
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
@@ -108,7 +108,7 @@ def refined(
     allowed: np.ndarray,  # [H, W] bool, source patch centres
     settings: PatchMatchSettings,
     penalty: np.ndarray | None = None,  # [H, W] float32
-    index: PatchIndex | None = None,  # of allowed patches
+    index: tuple[Components, Tree] | None = None,  # of allowed patches
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
     tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
@@ -126,7 +126,8 @@ def refined(
     number[wanted] = np.arange(len(wanted[0]))
     tree, looks = NO_TREE, np.empty(0, np.float32)
     if index is not None:
-        tree, looks = index.tree, coordinates(patches, index.components, patches.starts(*wanted)).ravel()
+        components, tree = index
+        looks = coordinates(patches, components, patches.starts(*wanted)).ravel()
     # Bands hold about as many target pixels each; they depend on nothing else.
     per_row = np.cumsum(target.sum(1))
     count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))

@@ -26,11 +26,11 @@ AXES = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))  # pixels and th
 
 @dataclass(frozen=True)
 class PoissonSolution:
-    """A filled array, or only the M pixels of the hole, in the order of array[hole]."""
+    """A filled array."""
 
-    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced; or [M] or [M, C]
+    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced
     iterations: int  # most of any channel
-    unanchored: np.ndarray  # [H, W] or [M] bool, hole pixels of components that touch no known pixel
+    unanchored: np.ndarray  # [H, W] bool, hole pixels of components that touch no known pixel
 
 
 def solve_poisson(
@@ -42,18 +42,16 @@ def solve_poisson(
     *,
     weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor` (or to 0)
     anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
-    only_hole: bool = False,  # for large images with small holes: nothing else is made and returned
 ) -> PoissonSolution:
     """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
 
     This is paper 3.3 with its sign mended (docs/method.md): the solution's gradients are the guidance's, not their
     opposites. Neighbours that are neither hole nor known, and the image's border, are natural (Neumann): they are
-    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels that are
-    not finite are not known; weights and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the
-    most.
+    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels, weights
+    and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the most.
 
-    A component of the hole that touches no known pixel (and is drawn to no anchor) is reported as unanchored. It takes
-    the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
+    A component of the hole that touches no known pixel (and is drawn to no anchor) is unanchored: it takes the guidance
+    as it is, which settles the free constant. Where there is none, it is NaN.
     """
     hole = np.asarray(hole, bool)
     window = bounds(hole, 1)
@@ -70,11 +68,8 @@ def solve_poisson(
     aim[pull == 0] = 0
     task = _Task(cut(hole), cut(np.asarray(known, bool)), fixed, guide, np.minimum(pull, MOST_WEIGHT), aim)
     found, iterations, loose = _solve(task, tolerance)
-    inside, loose = found[task.hole].reshape(-1, *np.shape(values)[2:]), loose[task.hole]
-    if only_hole:
-        return PoissonSolution(inside, iterations, loose)
     filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
-    filled[hole], unanchored[hole] = inside, loose
+    filled[hole], unanchored[hole] = found[task.hole].reshape(-1, *np.shape(values)[2:]), loose[task.hole]
     return PoissonSolution(filled, iterations, unanchored)
 
 

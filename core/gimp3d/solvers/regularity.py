@@ -39,14 +39,11 @@ class Motion:
     misfit: float  # RMS grey levels of what is not explained
 
 
-def find_motions(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool, what the picture shows well
-) -> tuple[Motion, ...]:
-    """The motions that explain what is round the hole, best first; none in most pictures.
+def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[Motion, ...]:
+    """The motions that explain what is round a picture's hole, best first; none in most pictures.
 
-    Reflections are asked where nothing turns or repeats: what has both tells by either.
+    The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool. Reflections are asked where
+    nothing turns or repeats: what has both tells by either.
     """
     scale = min(1.0, SIDE / max(hole.shape))
     size = (max(1, round(hole.shape[1] * scale)), max(1, round(hole.shape[0] * scale)))
@@ -74,12 +71,9 @@ def find_motions(
 
 
 def continue_regularly(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool
-    motions: tuple[Motion, ...],
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray, motions: tuple[Motion, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture with what motions tell of the hole, and which of its pixels [H, W] bool they tell of."""
+    """The picture with what motions, see find_motions, tell of the hole, and of which of its pixels [H, W] bool."""
     filled, left = image.copy(), hole.copy()
     for motion in motions:
         rows, cols = np.nonzero(left)

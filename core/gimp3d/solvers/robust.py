@@ -27,11 +27,8 @@ def robust_fit(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]
     return x, sigma
 
 
-def exposure_gain(
-    before: np.ndarray,  # [N, 3] grey levels
-    after: np.ndarray,  # [N, 3] of the same points
-) -> np.ndarray:
-    """[3] exposure of the second colours over the first ones', by well exposed pairs; 1 where there are few."""
+def exposure_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[3] exposure of the second grey levels [N, 3] over the first ones', by well exposed pairs; 1 where few are."""
     exposed = ((before > 16) & (after > 16) & (before < 250) & (after < 250)).T
     ratios = [after[where, c] / before[where, c].astype(np.float64) for c, where in enumerate(exposed)]
     return np.array([np.median(r) if len(r) >= 50 else 1.0 for r in ratios])

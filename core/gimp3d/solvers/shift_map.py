@@ -127,19 +127,16 @@ def fill_inwards(
     """(rows, cols) [H, W] int32: the pixel that each hole pixel is copied from, -1 elsewhere.
 
     The next place is the one with most known around it where the strongest edges run into the hole (Criminisi 2004):
-    so edges are continued straight until they meet, before what lies between them is filled. What was copied counts
-    as less known the further from the rim it lies. The source is the patch that differs least from what is known of
-    the place's own.
+    so edges are continued straight until they meet. What was copied counts as less known the further from the rim it
+    lies. The source is the patch that differs least from what is known of the place's own.
     """
-    patches = lay_out(channels, radius)
-    rows, cols = np.nonzero(allowed)
-    thinned = slice(None, None, -(-len(rows) // MOST_SOURCES))
+    sources = np.argwhere(allowed)
+    sources = sources[:: -(-len(sources) // MOST_SOURCES)]
     known = np.pad((~hole).astype(np.float32), radius)
-    found_rows, found_cols = np.full((2, *hole.shape), -1, np.int32)
     share = cv2.blur(known, (2 * radius + 1,) * 2, borderType=cv2.BORDER_CONSTANT)
-    places = np.argwhere(hole)
-    _fill_inwards(*patches, first, places, rows[thinned], cols[thinned], known, share, found_rows, found_cols)
-    return found_rows, found_cols
+    rows, cols = np.full((2, *hole.shape), -1, np.int32)
+    _fill_inwards(*lay_out(channels, radius), first, np.argwhere(hole), sources, known, share, rows, cols)
+    return rows, cols
 
 
 @inline_kernel
@@ -171,9 +168,7 @@ def _edge_into_hole(values, stride, channels, radius, known, y, x):
 
 
 @kernel
-def _fill_inwards(
-    values, stride, channels, radius, row_weights, first, places, source_rows, source_cols, known, share, rows, cols,
-):  # fmt: skip
+def _fill_inwards(values, stride, channels, radius, row_weights, first, places, sources, known, share, rows, cols):
     """`known` and `share` are [H + 2 radius, W + 2 radius]: a pixel's confidence and its mean over the patch."""
     h, w = rows.shape
     size, width = 2 * radius + 1, len(row_weights)
@@ -204,9 +199,9 @@ def _fill_inwards(
             for j in range(width):
                 there = j < size * channels and known[y + i, x + j // channels] > 0
                 weights[i * width + j] = float32(1) if there else float32(0)
-        least, best_v, best_u = float32(1e30), source_rows[0], source_cols[0]
-        for k in range(len(source_rows)):
-            v, u = source_rows[k], source_cols[k]
+        least, (best_v, best_u) = float32(1e30), sources[0]
+        for k in range(len(sources)):
+            v, u = sources[k]
             one, other = y * stride + x * channels, v * stride + u * channels
             total = splat16(float32(0))
             for i in range(size):

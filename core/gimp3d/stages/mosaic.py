@@ -22,17 +22,15 @@ def mosaic(
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
+    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best; 0 of none.
 
-    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: light
-    differs between photos on any surface, but things that do not lie on it also show another texture in each. And how
-    loud the texture is that most of them show, likewise: a loud one differs more where photos are a little misplaced.
+    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: things
+    that do not lie on the surface show another texture in each, whatever the light. And how loud the texture is that
+    most of them show, likewise: a loud one differs more where photos are a little misplaced.
 
-    Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
-    decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time, brought
-    to the median's colours by a smooth correction: the one with most pixels there of those that need little of it.
-    Between photos only detail changes, so that no seam shows (two bands of Burt & Adelson 1983). 0 where no photo
-    shows the surface.
+    Where photos disagree, the median of each channel decides. As misplaced photos blur its detail, that comes from one
+    photo at a time, brought to the median's colours by a smooth correction: the one with most pixels there of those
+    that need little of it. So no seam shows between photos (two bands of Burt & Adelson 1983).
     """
     h, w = points.shape[:2]
     clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do

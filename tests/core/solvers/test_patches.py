@@ -103,7 +103,7 @@ def test_every_allowed_patch_of_the_grid_lies_in_one_leaf(
     allowed = random.random((height, width)) < density
     allowed[random.integers(height), random.integers(width)] = True
     patches = lay_out(np.round(smooth(height, width, seed), 1), 1)  # rounded: many are equal
-    tree = index_patches(patches, allowed, step).tree
+    _, tree = index_patches(patches, allowed, step)
     on_grid = np.zeros_like(allowed)
     on_grid[::step, ::step] = True
     wanted = np.argwhere(allowed & on_grid if (allowed & on_grid).any() else allowed)
@@ -120,11 +120,10 @@ def test_leaves_hold_the_coordinates_of_their_patches() -> None:
     patches = lay_out(smooth(50, 60), 2)
     allowed = np.zeros((50, 60), bool)
     allowed[2:48, 2:58] = True
-    index = index_patches(patches, allowed, 2)
-    tree = index.tree
+    components, tree = index_patches(patches, allowed, 2)
     there = tree.rows >= 0
     found = tree.features.reshape(-1, 16, 16).transpose(0, 2, 1).reshape(-1, 16)
-    expected = coordinates(patches, index.components, patches.starts(tree.rows[there], tree.cols[there]))
+    expected = coordinates(patches, components, patches.starts(tree.rows[there], tree.cols[there]))
     np.testing.assert_array_equal(found[there], expected)
     assert (found[~there] > 1e17).all()
 
@@ -132,14 +131,13 @@ def test_leaves_hold_the_coordinates_of_their_patches() -> None:
 def test_patches_are_led_to_their_own_leaf_or_to_one_like_it() -> None:
     patches = lay_out(smooth(90, 120), 2)
     allowed = np.ones((90, 120), bool)
-    index = index_patches(patches, allowed, 2)
-    tree = index.tree
+    components, tree = index_patches(patches, allowed, 2)
     there = tree.rows >= 0
-    found = coordinates(patches, index.components, patches.starts(tree.rows[there], tree.cols[there]))
+    found = coordinates(patches, components, patches.starts(tree.rows[there], tree.cols[there]))
     led = leaves(tree, found)
     assert (led == np.arange(len(tree.rows))[there] // 16).mean() > 0.98  # the rest lies on a split
     others = patches.starts(*np.nonzero(~((np.arange(90) % 2 == 0)[:, None] & (np.arange(120) % 2 == 0))))
-    looks = coordinates(patches, index.components, others)
+    looks = coordinates(patches, components, others)
     in_leaf = tree.features.reshape(-1, 16, 16)[leaves(tree, looks)]
     nearest = ((in_leaf - looks[:, :, None]) ** 2).sum(1).min(1)
     anywhere = np.median(((found[::97, None] - looks[None, ::50]) ** 2).sum(2))
@@ -151,7 +149,7 @@ def test_the_tree_does_not_depend_on_the_thread_count() -> None:
     trees = []
     for threads in (1, 2, 4):
         set_thread_count(threads)
-        trees.append(index_patches(patches, allowed, 1).tree)
+        trees.append(index_patches(patches, allowed, 1)[1])
     for other in trees[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(trees[0], other))
 
@@ -161,6 +159,6 @@ def test_constant_pictures_and_single_patches_are_indexed() -> None:
     for count in (1, 15, 16, 17, 100):
         allowed = np.zeros(600, bool)
         allowed[:count] = True
-        tree = index_patches(patches, allowed.reshape(20, 30), 1).tree
+        _, tree = index_patches(patches, allowed.reshape(20, 30), 1)
         assert (tree.rows >= 0).sum() == count
         assert np.isfinite(tree.features).all() and np.isfinite(tree.split_value).all()
