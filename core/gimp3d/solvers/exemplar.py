@@ -211,11 +211,11 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     rim[rim] = np.abs(said - picture[rim]).max(1) < DISAGREEMENT
     slopes = []
     for dy, dx in ((0, 1), (1, 0)):
-        slope = np.zeros_like(picture)
-        slope[: len(slope) - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
-        across = hole.copy()  # pixels whose step to the right or down begins or ends in the hole
-        across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
-        across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
+        inner = np.ones_like(hole)
+        inner[len(hole) - dy :], inner[:, hole.shape[1] - dx :] = False, False
+        slope = np.where(inner[..., None], np.roll(picture, (-dy, -dx), (0, 1)) - picture, np.float32(0))
+        # pixels whose step to the right or down begins or ends in the hole
+        across = inner & (hole | np.roll(hole, (-dy, -dx), (0, 1)))
         places = np.argwhere(across) + corner
         voted = _voted(level, field, slope[across], places, (dy, dx))
         slope[across] = voted + COPIED * (_copied_steps(level, sources, places, (dy, dx)) - voted)
@@ -241,15 +241,14 @@ def _copied_steps(
 
 
 def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT)."""
+    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT).
+
+    There are none from the last column and row.
+    """
     import scipy.fft  # takes a twentieth of a second, which removals that fill no picture need not wait for
 
     h, w, _ = along_x.shape
-    divergence = np.zeros_like(along_x)
-    divergence[:, :-1] += along_x[:, :-1]
-    divergence[:, 1:] -= along_x[:, :-1]
-    divergence[:-1] += along_y[:-1]
-    divergence[1:] -= along_y[:-1]
+    divergence = along_x - np.roll(along_x, 1, 1) + along_y - np.roll(along_y, 1, 0)
     waves = scipy.fft.dctn(divergence, axes=(0, 1))
     eigenvalues = 2 * (np.cos(np.pi * np.arange(h) / h)[:, None] + np.cos(np.pi * np.arange(w) / w)) - 4
     eigenvalues[0, 0] = 1.0

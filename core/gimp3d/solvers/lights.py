@@ -57,8 +57,7 @@ class Shading:
         operator = sparse.block_diag(operators).tocsr()
         group = np.concatenate([kinds + 1000 * number for number, kinds in enumerate(groups)])
         colours = np.concatenate([s.colours[s.shown] for s in surfaces])
-        luminance = np.log(np.exp(colours).mean(1))
-        observed = operator @ luminance
+        observed = operator @ np.log(np.exp(colours).mean(1))  # of luminance
         hues = operator @ colours - observed[:, None]
         other = operator @ scipy.linalg.block_diag(*(_besides(s, bent) for s in surfaces))
         noise = _usual(observed - other @ _explained(observed, other, group), group)

@@ -67,17 +67,19 @@ def nearest_neighbour_field(
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most.
 
-    Minimises (1 − λ_s)·appearance + λ_s·spatial + penalty (paper eq. 8). Appearance is the mean squared
-    difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
-    scaled to [0, 1] (PixMix, Herling & Broll 2014). A source patch lies inside the image and holds no target
-    pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
+    Minimises (1 − λ_s)·appearance + λ_s·spatial + penalty (paper eq. 8). Appearance is the mean squared difference over
+    the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and scaled to [0, 1] (PixMix,
+    Herling & Broll 2014). A source patch lies inside the image and holds no target pixel; where there is no room for
+    one, patches shrink. Between equal sources the nearest wins.
     """
     radius = settings.patch // 2
     while not (allowed := source & patch_centres(~target, radius)).any() and radius > 0:
         radius -= 1
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
-    return refined(None, patches, target, allowed, settings, penalty, index)
+    rows, cols = np.full((2, *target.shape), -1, np.int32)
+    nothing = NearestNeighbourField(rows, cols, np.zeros(target.shape, np.float32), radius)
+    return refined(nothing, patches, target, allowed, settings, penalty, index)
 
 
 def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
@@ -102,7 +104,7 @@ def upsampled(field: NearestNeighbourField, target: np.ndarray, allowed: np.ndar
 
 
 def refined(
-    field: NearestNeighbourField | None,  # a first guess; where it has no allowed source the nearest one is tried
+    field: NearestNeighbourField,  # a first guess; where it has no allowed source the nearest one is tried
     patches: Patches,
     target: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, source patch centres
@@ -114,11 +116,13 @@ def refined(
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
-    rows, cols = np.full((2, h, w), -1, np.int32)
-    cost = np.zeros((h, w), np.float32)
+    (rows, cols), cost = np.full((2, h, w), -1, np.int32), np.zeros((h, w), np.float32)
     if not allowed.any() or not target.any():
         return NearestNeighbourField(rows, cols, cost, patches.radius)
-    start = _first_guess(field, target, allowed)
+    kept, start = field.found & target, np.stack([field.rows, field.cols])
+    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+    if (kept != target).any():
+        start = np.where(kept, start, nearest_allowed(allowed))
     extra = np.zeros((h, w), np.float32) if penalty is None else penalty.astype(np.float32)
     guides = np.empty((h, w, 0), np.float32) if guides is None else guides
     weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
@@ -142,20 +146,6 @@ def refined(
         )  # fmt: skip
         parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
     return NearestNeighbourField(rows, cols, cost, patches.radius)
-
-
-def _first_guess(
-    field: NearestNeighbourField | None, target: np.ndarray, allowed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The field where its sources are allowed, elsewhere the nearest allowed ones."""
-    if field is None:
-        return nearest_allowed(allowed)
-    kept = field.found & target
-    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
-    if (kept == target).all():
-        return field.rows, field.cols
-    rows, cols = nearest_allowed(allowed)
-    return np.where(kept, field.rows, rows), np.where(kept, field.cols, cols)
 
 
 def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -184,12 +174,10 @@ def _sweep_band(
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
     start_rows, start_cols, first, downward, random, old_rows, old_cols, rows, cols, cost, band,
 ):  # fmt: skip
-    """One sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones
-    near.
+    """A sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones.
 
-    The first sweep begins with `start` and each patch's own leaf. Neighbours in this band are up to date, others
-    are as the last sweep left them. A candidate's cost is found in one place, written out: a helper that takes
-    arrays would count references for each.
+    The first sweep begins with `start` and each patch's own leaf. A candidate's cost is found in one place, written
+    out: a helper that takes arrays would count references for each.
     """
     (lo, hi), (h, w) = band, target.shape
     size, step, salt = 2 * radius + 1, 1 if downward else -1, _hash(random)
