@@ -299,7 +299,7 @@ def _voted(
     places: np.ndarray | None = None,  # [N, 2] rows and columns; None: the hole's
     step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each pixel looks like, [N, C] float32; what fits badly has little say."""
+    """What the overlapping patches say each pixel looks like, [N, C] float32; those that fit badly have little say."""
     places = np.argwhere(level.hole) if places is None else places
     costs, weights = field.cost[level.touching], np.zeros(level.hole.shape)
     poor = max(float(np.percentile(costs, 75)), 255.0**-2)

@@ -29,15 +29,14 @@ PLAIN = 0.03  # slope of colour per pixel, where no edge runs into the hole, by 
 
 
 def shift_map(
-    picture: np.ndarray,  # [H, W, 3] float32, the hole as patches vote
-    hole: np.ndarray,  # [H, W] bool
-    usable: np.ndarray,  # [H, W] bool, pixels to copy
-    field: NearestNeighbourField,  # of patches that the hole changes
+    picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field: NearestNeighbourField
 ) -> NearestNeighbourField:
     """The field in which each of the hole's pixels has a source that it is to be copied from, not a patch's centre.
 
-    A pixel takes its own shift or one of its eight neighbours', whichever costs least: the mean squared difference of
-    source and votes in a window, and along a seam how much the two shifts' sources differ on both its sides.
+    The picture [H, W, 3] float32 shows in its hole what patches vote for; `usable` [H, W] bool are pixels to copy; the
+    field is of patches that the hole changes. A pixel takes its own shift or one of its eight neighbours', whichever
+    costs least: the mean squared difference of source and votes in a window, and along a seam how much the two shifts'
+    sources differ on both its sides.
     """
     known = usable.astype(np.float32)
     share = np.maximum(cv2.GaussianBlur(known, (0, 0), BLUR), 1e-3)[..., None]
