@@ -94,7 +94,7 @@ def completed(
     """Method → filled picture and CPU seconds."""
     holed = np.where(hole[..., None], np.uint8(0), picture)
     fills = {}
-    runs: dict[str, Any] = {OURS: lambda: complete_picture(holed, hole).image}
+    runs: dict[str, Any] = {OURS: lambda: complete_picture(holed, hole)[0]}
     runs |= {m: lambda s=spec: inpaint_reference(s, holed, hole).image for m, spec in OPENCV.items()}
     complete_picture(holed[:96, :96], np.pad(np.ones((20, 20), bool), 38))  # compile
     for method, run in runs.items():

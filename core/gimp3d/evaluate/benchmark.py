@@ -18,6 +18,7 @@ from ..box import read_region
 from ..camera import output_name
 from ..commands import render_views, run_removal, select_cameras
 from ..errors import BadInput
+from ..geometry import dilated
 from ..io.cameras import read_cameras
 from ..io.images import read_image, read_mask, write_png
 from ..io.ply import read_ply, write_ply
@@ -32,13 +33,9 @@ BASELINES = ("hole open", "telea")
 
 
 def run_benchmark(
-    data: Path,
-    out: Path,
-    scenes: Sequence[str] = (),
-    presets: Sequence[str] = ("balanced",),
-    progress: Progress = silent,
+    data: Path, out: Path, scenes: Sequence[str], presets: Sequence[str], progress: Progress = silent
 ) -> list[dict[str, Any]]:
-    """Run every scene below `data` with every preset and baseline; one row of scores each.
+    """Run scenes below `data`, all if none is named, with every preset and baseline; one row of scores each.
 
     Raises
     ------
@@ -48,20 +45,17 @@ def run_benchmark(
     names = list(scenes) or sorted(p.parent.name for p in data.glob("*/truth") if (p.parent / "scene.ply").exists())
     if not names or not all((data / n / "truth").is_dir() for n in names):
         raise BadInput(f"bench: {data} holds no scene folders with scene.ply, transforms.json, roi.json and truth/")
-    methods = (*BASELINES, *presets)
-    rows = []
-    for k, name in enumerate(names):
-        for m, method in enumerate(methods):
-            progress("bench", k * len(methods) + m, len(names) * len(methods), f"{name}: {method}")
-            rows.append(_run(data / name, out / name / method.replace(" ", "_"), method))
+    runs, rows = [(name, method) for name in names for method in (*BASELINES, *presets)], []
+    for k, (name, method) in enumerate(runs):
+        progress("bench", k, len(runs), f"{name}: {method}")
+        rows.append(_run(data / name, out / name / method.replace(" ", "_"), method))
     progress("bench", 1, 1, "done")
     return rows
 
 
 def _run(scene: Path, out: Path, method: str) -> dict[str, Any]:
     cameras = select_cameras(read_cameras(scene / "transforms.json"), "test")
-    reference, start = cameras[0], time.perf_counter()
-    added = 0
+    reference, start, added = cameras[0], time.perf_counter(), 0
     if method == "telea":
         for camera in cameras[1:]:
             name = output_name(camera.id)
@@ -86,8 +80,8 @@ def score_renders(scene: Path, renders: Path, reference: str) -> dict[str, float
     """Means over the drawn test views but the reference: "psnr mask", "ssim unseen" and so on."""
     folder = Path(output_name(reference)).parent
     row: dict[str, float] = {}
+    folders = (renders / folder, scene / folder, scene / "truth" / folder)
     for key, suffix in MASKS.items():
-        folders = (renders / folder, scene / folder, scene / "truth" / folder)
         scores = evaluate_folders(*folders, suffix, (Path(reference).name,))
         row |= {f"{metric} {key}": value for metric, value in scores["mean"].items()}
     return row
@@ -105,13 +99,9 @@ def photo_with_object(scene: Path, camera_id: str) -> np.ndarray:
     return read_image(next((scene / "images").glob(f"with_test_{stem}.*"), scene / "images" / f"with_test_{stem}.png"))
 
 
-def telea(
-    photo: np.ndarray,  # [H, W, 3] uint8
-    mask: np.ndarray,  # [H, W] bool
-) -> np.ndarray:
-    """OpenCV's Telea on the photo, the mask dilated; [H, W, 3] uint8."""
-    grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * DILATION + 1,) * 2, np.uint8))
-    return cv2.inpaint(photo, grown, 3, cv2.INPAINT_TELEA)
+def telea(photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """OpenCV's Telea on a photo [H, W, 3] uint8, the mask [H, W] bool dilated; [H, W, 3] uint8."""
+    return cv2.inpaint(photo, dilated(mask, DILATION).astype(np.uint8), 3, cv2.INPAINT_TELEA)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -128,8 +118,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         means.append({"scene": "**mean**", "method": method, **numbers})
     for row in [*rows, *means]:
         cells = [f"{row[k]:.2f}" if k.startswith("psnr") else f"{row[k]:.3f}" for k in keys]
-        extra = [f"{row['added']:.0f}", f"{row['seconds']:.1f}"]
-        if row["method"] in BASELINES:
-            extra = ["", ""]  # no removal was run: times would compare nothing
+        removed = row["method"] not in BASELINES  # else no removal was run: times would compare nothing
+        extra = [f"{row['added']:.0f}", f"{row['seconds']:.1f}"] if removed else ["", ""]
         lines.append(f"| {row['scene']} | {row['method']} | {' | '.join([*cells, *extra])} |")
     return "\n".join(lines)

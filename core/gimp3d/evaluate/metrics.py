@@ -18,12 +18,8 @@ SSIM_SIGMA, SSIM_SIDE = 1.5, 11  # Wang et al. 2004
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".exr"}  # what a camera's ID may end in
 
 
-def psnr(
-    pred: np.ndarray,  # [H, W, 3] uint8
-    truth: np.ndarray,  # [H, W, 3] uint8
-    mask: np.ndarray,  # [H, W] bool, not empty
-) -> float:
-    """Peak signal-to-noise ratio in dB over the mask's pixels and channels.
+def psnr(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of pictures [H, W, 3] uint8 over a mask's pixels, [H, W] bool, not empty.
 
     Examples
     --------
@@ -35,11 +31,8 @@ def psnr(
     return PSNR_OF_EQUAL if error == 0 else min(PSNR_OF_EQUAL, 10 * float(np.log10(255.0**2 / error)))
 
 
-def ssim_map(
-    pred: np.ndarray,  # [H, W, 3] uint8
-    truth: np.ndarray,  # [H, W, 3] uint8
-) -> np.ndarray:
-    """Structural similarity per pixel, mean of the channels, [H, W] (Wang et al. 2004, Gaussian window, σ 1.5)."""
+def ssim_map(pred: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] structural similarity of pictures [H, W, 3] uint8, mean of the channels (Wang et al. 2004)."""
     a, b = pred.astype(np.float64) / 255, truth.astype(np.float64) / 255
 
     def blur(x: np.ndarray) -> np.ndarray:
@@ -53,11 +46,8 @@ def ssim_map(
     return (top / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(-1)
 
 
-def flip_map(
-    pred: np.ndarray,  # [H, W, 3] uint8
-    truth: np.ndarray,  # [H, W, 3] uint8
-) -> np.ndarray:
-    """LDR-FLIP per pixel, [H, W] in [0, 1] (Andersson et al. 2020), by NVIDIA's flip-evaluator.
+def flip_map(pred: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] LDR-FLIP in [0, 1] of pictures [H, W, 3] uint8 (Andersson et al. 2020), by NVIDIA's flip-evaluator.
 
     Raises
     ------
@@ -68,14 +58,8 @@ def flip_map(
         import flip_evaluator
     except ImportError:
         raise BadInput("evaluate: FLIP needs the package flip-evaluator (pip install 'gimp3d[evaluate]')") from None
-    error, _, _ = flip_evaluator.evaluate(
-        truth.astype(np.float32) / 255,
-        pred.astype(np.float32) / 255,
-        "LDR",
-        applyMagma=False,
-        computeMeanError=False,
-        parameters={"ppd": PIXELS_PER_DEGREE},
-    )
+    pair, options = (p.astype(np.float32) / 255 for p in (truth, pred)), {"ppd": PIXELS_PER_DEGREE}
+    error, _, _ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=options)
     return np.asarray(error, np.float64).reshape(pred.shape[:2])
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import BadInput, IllPosed
 from ..io.images import read_image
-from ..solvers.exemplar import ExemplarSettings, complete_picture
+from ..solvers.exemplar import complete_picture
 from . import gemini, networks, servers
 from .calls import Call, Painter, command_painter
 from .pasting import Appearance, interpolated, paste_picture, window_round_hole
@@ -115,15 +115,14 @@ def exemplar(view: Unfinished) -> Appearance:
     """Texture of the hole's surroundings, from coarse to fine; what lies far off is seldom the same surface."""
     near = window_round_hole(view.hole)
     unknown = None if view.unknown is None else view.unknown[near]
-    settings = ExemplarSettings(PATCHES[view.variant % len(PATCHES)], seed=view.seed + view.variant)
-    done = complete_picture(view.image[near], view.hole[near], settings, unknown)
-    if np.isnan(done.misfit):
-        image = interpolated(view.image, view.hole)
-        return Appearance(image, 0.1, "no patch of the reference lies off the hole: interpolated")
-    confidence = 0.7 * float(np.exp(-done.misfit / CONFIDENCE_SCALE))
+    patch = PATCHES[view.variant % len(PATCHES)]
+    filled, misfit = complete_picture(view.image[near], view.hole[near], patch, view.seed + view.variant, unknown)
+    if np.isnan(misfit):
+        return Appearance(telea(view).image, 0.1, "no patch of the reference lies off the hole: interpolated")
+    confidence = 0.7 * float(np.exp(-misfit / CONFIDENCE_SCALE))
     whole = view.image.copy()
-    whole[near] = done.image
-    words = f"filled with the view's own texture, which fits to {done.misfit:.1f} grey levels"
+    whole[near] = filled
+    words = f"filled with the view's own texture, which fits to {misfit:.1f} grey levels"
     return Appearance(whole, confidence, words)
 
 

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
+from ..geometry import bounds
+from .regularity import pattern_search
 
 SIDE = 192  # px: pictures are shrunk to this to look for edges
 ANGLE = 2.0  # degrees between directions that are tried
@@ -51,12 +53,11 @@ class Edge:
     mean: np.ndarray  # [3] grey levels, of what lies to its left and right
 
 
-def find_edges(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool, what the picture shows well
-) -> tuple[Edge, ...]:
-    """The edges that run into each part of the hole on one side and go on, with the same colours, on the other."""
+def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[Edge, ...]:
+    """The edges that run into each part of a picture's hole on one side and go on, alike, on the other.
+
+    The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool.
+    """
     count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     picture = image.astype(np.float32)
     found: list[Edge] = []
@@ -67,9 +68,7 @@ def find_edges(
 
 
 def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
-    rows, cols = np.nonzero(hole)
-    far = FURTHEST * REACH
-    near = np.s_[max(0, rows.min() - far) : rows.max() + far + 1, max(0, cols.min() - far) : cols.max() + far + 1]
+    near = bounds(hole, FURTHEST * REACH)
     corner = np.array([near[1].start, near[0].start])
     picture, hole, known = picture[near], hole[near], known[near]
     scale = min(1.0, SIDE / max(hole.shape))
@@ -82,8 +81,7 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
     heart = (told.shape[2] - 1) / 2
     middle = (np.array(size) - 1) / 2
     places = np.argwhere(open_)[:, ::-1] - middle
-    whole: list[Edge] = []
-    halves: list[_Half] = []
+    found: list[Edge | _Half] = []
     for number in range(2 * MOST):
         sides = slice(BOTH, BOTH + 1) if number < MOST and told[:, BOTH].any() else slice(BEFORE, AFTER + 1)
         k, side, row = (int(n) for n in np.unravel_index(told[:, sides].argmax(), told[:, sides].shape))
@@ -97,10 +95,8 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
         if cut.max() - cut.min() >= LEAST_CUT * scale:
             place = ((offset * across + middle) + 0.5) / scale - 0.5
             edge = _settled(picture, known, hole, angles[k], place, side)
-        if isinstance(edge, Edge):
-            whole.append(edge)
-        elif edge is not None:
-            halves.append(edge)
+        if edge is not None:
+            found.append(edge)
         ways = (cut.min(), along), (cut.max(), -along)
         for end, inwards in (ways, ways[:1], ways[1:])[side]:
             place = offset * across + end * along
@@ -109,7 +105,9 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
                 beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
                 here = BEFORE if inwards @ axes[0] > 0 else AFTER
                 told[other, [[BOTH], [here if edge is not None or side != BOTH else BOTH]], beside] = 0
-    return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *_joined(halves, hole)]]
+    whole = [edge for edge in found if isinstance(edge, Edge)]
+    halves = _joined([half for half in found if isinstance(half, _Half)], hole)
+    return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *halves]]
 
 
 @dataclass(frozen=True)
@@ -186,49 +184,35 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
     counts = sums[..., 0]
     first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
     last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
-    sides = []
-    for lo, hi in ((np.maximum(first, begins - far), begins), (ends, np.minimum(last, ends + far))):
-        whole = np.zeros((side, 7))
-        whole[rows] = sums[number, hi] - sums[number, lo]
-        sides.append(whole)
-    pairs = [(_above(s), _below(s)) for s in sides]
+    whole = np.zeros((2, side, 7))  # of the two sides
+    whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - far)]
+    whole[1, rows] = sums[number, np.minimum(last, ends + far)] - sums[number, ends]
+    pairs = np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1)
     both, *halves = (_told(told, 2 * LEAST * scale) for told in (pairs, pairs[:1], pairs[1:]))
     return np.stack([both, *(np.where(half >= HALF_TELLS, half, 0.0) for half in halves)])
 
 
-def _above(rows: np.ndarray) -> np.ndarray:
-    return np.roll(rows, 1, 0) + np.roll(rows, 2, 0)
+def _told(sums: np.ndarray, least: float) -> np.ndarray:
+    """[N]: steps between two rows above and two below, 0 for none.
 
-
-def _below(rows: np.ndarray) -> np.ndarray:
-    return np.roll(rows, -1, 0) + np.roll(rows, -2, 0)
-
-
-def _told(sides: Sequence[tuple[np.ndarray, np.ndarray]], least: float) -> np.ndarray:
-    """[N]: steps between two rows above and two below, of sums [N, 7]: pixels, colours, their squares; 0 for none."""
-    steps, told, enough = [], np.full(len(sides[0][0]), np.inf), np.full(len(sides[0][0]), True)
+    `sums` are [sides, 2 (above, below), N, 7]: pixels, colours, their squares; there are at least so many pixels.
+    """
+    pixels = sums[..., :1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        for pair in sides:
-            means, noise = [], np.zeros(len(told))
-            for sums in pair:
-                pixels = sums[:, :1]
-                means.append(sums[:, 1:4] / pixels)
-                spread = np.maximum((sums[:, 4:] / pixels - means[-1] ** 2).sum(1), 1.0)
-                noise = noise + CLUMPED * spread / pixels[:, 0]
-                enough = enough & (pixels[:, 0] >= least)
-            steps.append(means[1] - means[0])
-            size = np.linalg.norm(steps[-1], axis=1)
-            told = np.minimum(told, np.where(size >= STEEP, size / np.sqrt(noise), 0))
-        alike = (steps[0] * steps[-1]).sum(1) > LIKE * np.prod(
-            [np.linalg.norm(s, axis=1) for s in (steps[0], steps[-1])], axis=0
-        )
-    return np.where(enough & alike & (told >= TELLS), told, 0.0)
+        means = sums[..., 1:4] / pixels
+        spread = np.maximum((sums[..., 4:] / pixels - means**2).sum(-1), 1.0)
+        noise = (CLUMPED * spread / pixels[..., 0]).sum(1, dtype=np.float64)
+        steps = means[:, 1] - means[:, 0]
+        size = np.linalg.norm(steps, axis=-1)
+        told = np.where(size >= STEEP, size / np.sqrt(noise), 0).min(0)
+        alike = (steps[0] * steps[-1]).sum(-1) > LIKE * (size[0] * size[-1])
+    return np.where((pixels >= least).all((0, 1, 3)) & alike & (told >= TELLS), told, 0.0)
 
 
 def _settled(
     picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray, side: int
 ) -> Edge | _Half | None:
-    """The edge at full resolution: turned and shifted to where it is told best (pattern search: Hooke 1961)."""
+    """The edge at full resolution: turned and shifted to where it is told best."""
     rows, cols = np.nonzero(hole)
     pixels = np.stack([cols, rows], 1).astype(np.float64)
     shows = known.astype(np.float32)
@@ -249,18 +233,17 @@ def _settled(
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             sums = np.concatenate([np.ones_like(colours[..., :1]), colours, colours**2], -1) * there
             near = sums * (there.cumsum(1) <= REACH)
-            pair = tuple(near[rows].sum((0, 1))[None] for rows in (ABOVE, BELOW))
             if side not in (BOTH, BEFORE + number):
                 beyond = near
                 ends.append(start)
                 continue
             told_by = near
-            sides.append(pair)
-            steady = steady and _is_edge(near) and (side == BOTH or _is_border(near))
+            sides.append([near[rows].sum((0, 1)) for rows in (ABOVE, BELOW)])
+            steady = steady and _is_edge(near, border=side != BOTH)
             ends.append(float(t[_length(sums, _step(near))]))
-        told = float(_told(sides, 2 * LEAST)[0])
-        means = [[s[0, 1:4] / max(s[0, 0], 1) for s in pair] for pair in sides]
-        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), np.mean(means, (0, 1)))
+        pairs = np.array(sides)
+        told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
+        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
         if not steady or side == BOTH:
             return told, edge if steady else None
         inwards = 1 if side == BEFORE else -1
@@ -270,16 +253,11 @@ def _settled(
         dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
         return told, _Half(edge, enters, leaves, bool(dark))
 
-    values, step = np.zeros(2), 1.0
-    best = at(values)
-    while step > 0.1:
-        tried = [(at(m), m) for m in (values + step * s * np.eye(2)[k] for k in range(2) for s in (1, -1))]
-        (score, edge), move = max(tried, key=lambda t: t[0][0])
-        if score > best[0]:
-            best, values = (score, edge), move
-        else:
-            step /= 2
-    return best[1] if best[0] > 0 else None
+    def score(values: np.ndarray) -> float:
+        return at(values)[0]
+
+    values, best = pattern_search(score, np.eye(2))
+    return at(values)[1] if best > 0 else None
 
 
 def _mean(sums: np.ndarray) -> np.ndarray:
@@ -292,22 +270,19 @@ def _step(sums: np.ndarray, above: slice = ABOVE, below: slice = BELOW) -> np.nd
     return _mean(sums[below]) - _mean(sums[above])
 
 
-def _is_edge(sums: np.ndarray) -> bool:
-    """Whether colours step at once, and all along a line near the hole: further off it may end, as at a corner."""
+def _is_edge(sums: np.ndarray, border: bool) -> bool:
+    """Whether colours step at once, and all along a line near the hole: further off it may end, as at a corner.
+
+    As a border, it must part two regions: a thin line, or one of a texture's, has the same colours further off again.
+    """
     pixels = sums[..., 0].sum(0).cumsum()
     block = np.minimum((BLOCKS * pixels / max(pixels[-1], 1)).astype(int), BLOCKS - 1)
     whole = _step(sums)
     size = max(float(np.linalg.norm(whole)), 1e-9)
     each = np.array([_step(sums[:, block == k]) for k in range(BLOCKS)]) @ whole / size
-    sharp = size**2 >= SHARP * (_step(sums, FAR_ABOVE, FAR_BELOW) @ whole)
-    near = each[:CLOSEST]
-    return bool(sharp and near.min() >= STEADY * np.median(near))
-
-
-def _is_border(sums: np.ndarray) -> bool:
-    """Whether it parts two regions: a thin line, or one of a texture's, has the same colours further off again."""
-    whole = _step(sums)
-    return bool(_step(sums, FAR_ABOVE, FAR_BELOW) @ whole >= STEADY * (whole @ whole))
+    far, near = _step(sums, FAR_ABOVE, FAR_BELOW) @ whole, each[:CLOSEST]
+    parts = not border or far >= STEADY * (whole @ whole)
+    return bool(parts and size**2 >= SHARP * far and near.min() >= STEADY * np.median(near))
 
 
 def _goes_on(beyond: np.ndarray, told_by: np.ndarray) -> bool:
@@ -331,15 +306,11 @@ def _length(sums: np.ndarray, whole: np.ndarray) -> int:
     return last
 
 
-def guide_of(
-    edges: Sequence[Edge],
-    shape: tuple[int, int],
-    shrunk: float,  # times, the picture that the edges were found in
-    width: float,  # px, σ
-) -> np.ndarray:
+def guide_of(edges: Sequence[Edge], shape: tuple[int, ...], shrunk: float, width: float) -> np.ndarray:
     """[h, w, 8] float32 in [-1, 1]: how near to an edge a pixel lies, on which side, the edge's step and mean colour.
 
-    Two pixels of the same guide lie at the same distance from edges of a kind; it is 0 far from one, and past its ends.
+    Of the picture that the edges were found in, so many times shrunk. Two pixels of the same guide lie at the same
+    distance from edges of a kind; it is 0 far from one (`width` is σ, px), and past its ends.
     """
     h, w = shape
     x, y = (np.arange(n, dtype=np.float32) for n in (w, h))

@@ -8,30 +8,32 @@ one place: an average of what disagrees is smooth.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..compute.jit import kernel
 from ..compute.threads import run_ranges
+from ..geometry import bounds, dilated
 from .edges import Edge, find_edges, guide_of
-from .greedy import fill_inwards
 from .kriging import Expected, expect
-from .patch_index import index_patches
-from .patches import lay_out, repainting
-from .patchmatch import (
-    NearestNeighbourField,
-    PatchMatchSettings,
-    nearest_allowed,
-    patch_centres,
-    refined,
-    upsampled,
-)
+from .patches import index_patches, lay_out, repainting
+from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
 from .poisson import solve_poisson
 from .regularity import continue_regularly, find_motions
-from .shift_map import shift_map
+from .shift_map import fill_inwards, shift_map
 
+PATCH = 13  # px, side of patches: smaller ones lose what is regular, such as tiles
+TEXTURE = 20.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
+THICKNESS = 4.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
+SMALLEST = 24  # px; no level is smaller
+COARSE_ROUNDS = 3  # of matching and voting on the coarsest level; finer ones have one
+SWEEPS = 2  # of PatchMatch per round
+RIM_TRUST = 1.5  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
+FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
+SETTLED = 0.3  # grey levels; a round that changes less ends its level
+LOCALITY = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
 VOTE_PIXELS = 1024  # per piece of work
 COPIED = 0.5  # of the filled picture's gradients is as copied, the rest as patches vote: more is sharper, and noisier
 MOSAICS = 8  # rounds that match what is copied: what is like votes, which are smooth, is smooth as well
@@ -43,47 +45,25 @@ EXPECTED = 1.0  # weight of expected colours beside a patch's misfit, where they
 LEAST_SAY = 1e-12  # of a patch that fits badly
 EDGE = 0.15  # difference in colour that counts as much as being on an edge, or beside it, or not
 GUIDE = np.array([EDGE, EDGE, *[1] * 6], np.float32)  # what differences of guide_of count: an edge's colours as others
-FURTHEST_TRUST = 400.0  # px from the rim beyond which trust falls no further: 5^-400 is a float64 still
-
-
-@dataclass(frozen=True)
-class ExemplarSettings:
-    """Lengths in pixels."""
-
-    patch: int = 13  # side, odd: smaller ones lose what is regular, such as tiles
-    texture: float = 20.0  # weight of squared texture features beside squared colours (Newson 2017: 50)
-    thickness: float = 4.0  # of the hole on the coarsest level, in half patches, at most; larger structures continue
-    smallest: int = 24  # no level is smaller
-    coarse_rounds: int = 3  # of matching and voting on the coarsest level; finer ones have one
-    sweeps: int = 2  # of PatchMatch per round
-    rim_trust: float = 1.5  # by which a patch's say falls with every pixel from the known rim (Wexler 2007)
-    settled: float = 0.3  # grey levels; a round that changes less ends its level
-    locality: float = 0.002  # cost of a source one image width away from the hole, (11 grey levels)²
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class Completion:
-    """A picture with its hole filled."""
-
-    image: np.ndarray  # [H, W, 3] uint8, outside the hole bit for bit the input
-    misfit: float  # RMS grey levels between pixels and their own patches' sources; NaN where none could be copied
 
 
 def complete_picture(
     image: np.ndarray,  # [H, W, 3] uint8
     hole: np.ndarray,  # [H, W] bool, not all of it
-    settings: ExemplarSettings = ExemplarSettings(),
+    patch: int = PATCH,  # px, odd
+    seed: int = 0,
     unknown: np.ndarray | None = None,  # [H, W] bool, neither to be filled nor to be copied
-) -> Completion:
+) -> tuple[np.ndarray, float]:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
 
-    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges.
+    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges. What is unknown
+    near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
 
-    What is unknown near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
+    Returns the picture [H, W, 3] uint8, outside the hole bit for bit the input, and its misfit: RMS grey levels between
+    pixels and their own patches' sources; NaN where none could be copied.
     """
     if not hole.any():
-        return Completion(image.copy(), 0.0)
+        return image.copy(), 0.0
     asked, given = hole, image
     if unknown is None or (unknown | hole).all():
         unknown = np.zeros(hole.shape, bool)
@@ -93,13 +73,12 @@ def complete_picture(
     motions = find_motions(image, hole, known)
     image, regular = continue_regularly(image, hole, known, motions)
     if (regular == hole).all():
-        return Completion(np.where(hole[..., None], image, given), max(m.misfit for m in motions))
-    hole = hole & ~regular
+        return np.where(hole[..., None], image, given), max(m.misfit for m in motions)
     # where photos disagree a little, what they show tells edges all the same
     edges = find_edges(given, asked, ~asked & given.any(-1))
-    done = _by_patches(image, hole, unknown, edges, settings)
+    done = _by_patches(image, hole & ~regular, unknown, edges, patch, seed)
     if done is None:
-        return Completion(given.copy(), float("nan"))
+        return given.copy(), float("nan")
     level, field, colours = done
     hole = level.hole
     sources = image[field.rows[hole], field.cols[hole]]
@@ -107,39 +86,7 @@ def complete_picture(
     filled = image.copy()
     filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
     filled[~asked] = given[~asked]  # what was filled besides
-    return Completion(filled, misfit)
-
-
-def _by_patches(
-    image: np.ndarray,
-    hole: np.ndarray,
-    unknown: np.ndarray,
-    edges: tuple[Edge, ...],
-    settings: ExemplarSettings,
-) -> tuple[_Level, NearestNeighbourField, np.ndarray] | None:
-    """The finest level, its field and the hole's colours, level by level; None if there is nothing to copy."""
-    radius = settings.patch // 2
-    patch = np.ones((settings.patch,) * 2, np.uint8)
-    hole = hole | (unknown & (cv2.dilate(hole.astype(np.uint8), patch) > 0))
-    unknown = unknown & ~hole
-    levels = _pyramid(image, hole, radius, settings)
-    while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
-        radius -= 1
-    if levels[-1][1].all():
-        return None
-    field: NearestNeighbourField | None = None
-    expected = expect(image / np.float32(255), hole, ~(hole | unknown))
-    for number, (channels, open_) in enumerate(reversed(levels)):
-        shape = open_.shape[::-1]
-        barred = cv2.resize(unknown.astype(np.float32), shape, interpolation=cv2.INTER_AREA) > 0
-        rounds = 1 if number else settings.coarse_rounds
-        smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture
-        guide = guide_of(edges, open_.shape, 2 ** (len(levels) - 1 - number), max(radius, 1))
-        level = _prepared(channels, open_, barred, GUIDE * guide, smooth, radius, settings)
-        mosaics = MOSAICS if number == len(levels) - 1 else 0
-        colours, field = _filled(level, field, rounds, mosaics, settings)
-    assert field is not None
-    return level, field, colours
+    return filled, misfit
 
 
 @dataclass(frozen=True)
@@ -153,31 +100,43 @@ class _Level:
     touching: np.ndarray  # [h, w] bool, centres of the patches that the hole changes
     usable: np.ndarray  # [h, w] bool, pixels to copy
     allowed: np.ndarray  # [h, w] bool, centres of patches to copy
-    trust: np.ndarray  # [touching pixels] float64, how well founded each of those patches is
+    trust: np.ndarray  # [touching pixels] float64 > 0, how well founded each of those patches is
     radius: int
 
 
-def _prepared(
-    channels: np.ndarray,
-    hole: np.ndarray,
-    unknown: np.ndarray,
-    edges: np.ndarray,
-    expected: Expected,
-    radius: int,
-    settings: ExemplarSettings,
-) -> _Level:
-    touching = cv2.dilate(hole.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
-    known = ~hole & ~unknown
-    if not patch_centres(known, radius).any():
-        known = ~hole
-    allowed = patch_centres(known, radius)
-    inwards = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
-    trust = settings.rim_trust ** -np.minimum(inwards, FURTHEST_TRUST)
-    return _Level(channels, hole, edges, expected, touching, known, allowed, trust, radius)
+def _by_patches(
+    image: np.ndarray, hole: np.ndarray, unknown: np.ndarray, edges: tuple[Edge, ...], patch: int, seed: int
+) -> tuple[_Level, NearestNeighbourField, np.ndarray] | None:
+    """The finest level, its field and the hole's colours, level by level; None if there is nothing to copy."""
+    radius = patch // 2
+    hole = hole | (unknown & dilated(hole, radius))
+    unknown = unknown & ~hole
+    levels = _pyramid(image, hole, radius)
+    while radius > 0 and not patch_centres(~levels[-1][1], radius).any():
+        radius -= 1
+    if levels[-1][1].all():
+        return None
+    field: NearestNeighbourField | None = None
+    expected = expect(image / np.float32(255), hole, ~(hole | unknown))
+    for finer in reversed(range(len(levels))):
+        channels, open_ = levels[finer]
+        barred = cv2.resize(unknown.astype(np.float32), open_.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+        smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture
+        guide = GUIDE * guide_of(edges, open_.shape, 2**finer, max(radius, 1))
+        usable = ~open_ & ~barred
+        if not patch_centres(usable, radius).any():
+            usable = ~open_
+        allowed, touching = patch_centres(usable, radius), dilated(open_, radius)
+        inwards = cv2.distanceTransform(open_.astype(np.uint8), cv2.DIST_L2, 5)[touching].astype(np.float64)
+        trust = RIM_TRUST ** -np.minimum(inwards, FURTHEST_TRUST)
+        level = _Level(channels, open_, guide, smooth, touching, usable, allowed, trust, radius)
+        colours, field = _filled(level, field, 0 if finer else MOSAICS, seed)
+    assert field is not None
+    return level, field, colours
 
 
 def _filled(
-    level: _Level, coarser: NearestNeighbourField | None, rounds: int, mosaics: int, settings: ExemplarSettings
+    level: _Level, coarser: NearestNeighbourField | None, mosaics: int, seed: int
 ) -> tuple[np.ndarray, NearestNeighbourField]:
     """The hole's channels [N, 5] and the field of one level.
 
@@ -188,21 +147,18 @@ def _filled(
     patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
     guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
     doubt = float(np.median(level.expected.variance[hole]))
-    usual = 0.0  # cost of patches that were found; not known at first
-    matching = PatchMatchSettings(coherence=0.0, sweeps=settings.sweeps)
+    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    penalty = np.float32(LOCALITY / hole.shape[1]) * away
     if coarser is None:
+        rounds, usual = COARSE_ROUNDS, 0.0  # cost of patches that were found; not known at first
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
         colours = level.channels[rows[hole], cols[hole]]
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
         index = index_patches(patches, allowed, TREE_GRID)
     else:
-        field, usual = upsampled(coarser, level.touching), float(np.median(coarser.cost[coarser.found]))
-        kept = field.found
-        kept[kept] = allowed[field.rows[kept], field.cols[kept]]
-        field = replace(field, rows=np.where(kept, field.rows, -1))
-        colours = _voted(level, field, level.trust, level.channels[hole])
-    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    penalty = np.float32(settings.locality / hole.shape[1]) * away
+        rounds, usual = 1, float(np.median(coarser.cost[coarser.found]))
+        field = upsampled(coarser, level.touching, allowed)
+        colours = _voted(level, field, level.channels[hole])
 
     def matched(
         field: NearestNeighbourField, colours: np.ndarray, number: int
@@ -211,26 +167,23 @@ def _filled(
         repaint(colours[:, :3])
         guides[hole] = colours[:, 3:]
         heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
-        field = refined(
-            field, patches, level.touching, allowed, replace(matching, seed=settings.seed + 31 * number), penalty,
-            index, np.dstack([guides, level.edges, heed * level.expected.colours]), tree_sweeps=1,
-        )  # fmt: skip
+        guided = np.dstack([guides, level.edges, heed * level.expected.colours])
+        matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
+        field = refined(field, patches, level.touching, allowed, matching, penalty, index, guided, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))
-        return field, _voted(level, field, _say(level, field), colours)
+        return field, _voted(level, field, colours)
 
     for number in range(rounds):
         field, voted = matched(field, colours, number)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
-        if change < settings.settled:
+        if change < SETTLED:
             break
-    for number in range(mosaics):
-        sources = _sources(level, field, colours)
-        there = sources.found[hole]
-        copied = np.where(there[:, None], level.channels[sources.rows[hole], sources.cols[hole]], colours)
-        centres = sources.found
-        centres[centres] = allowed[sources.rows[centres], sources.cols[centres]]
-        field, colours = matched(replace(sources, rows=np.where(centres, sources.rows, -1)), copied, rounds + number)
+    for number in range(rounds, rounds + mosaics):
+        field = _sources(level, field, colours)
+        there = field.found[hole]
+        copied = np.where(there[:, None], level.channels[field.rows[hole], field.cols[hole]], colours)
+        field, colours = matched(field, copied, number)
     return colours, field
 
 
@@ -241,48 +194,34 @@ def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     return shift_map(picture, level.hole, level.usable, field)
 
 
-def _say(level: _Level, field: NearestNeighbourField) -> np.ndarray:
-    """[touching pixels] float64: the weight of each patch's vote."""
-    costs = field.cost[level.touching]
-    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
-    return level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
-
-
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
     """The hole's colours [N, 3] without seams: the gradients of what is copied, fixed at the rim.
 
     Poisson's equation (Darabi 2012), drawn a little to the colours voted for. Patches vote for gradients as well;
-    what the two pixels are copied from has its say. Rim pixels that the
-    patches do not agree with at all, such as remains of what was removed, do not spread.
+    what the two pixels are copied from has its say. Rim pixels that the patches do not agree with at all, such as
+    remains of what was removed, do not spread.
     """
-    rows, cols = np.nonzero(level.hole)
-    box = np.s_[max(0, rows.min() - 1) : rows.max() + 2, max(0, cols.min() - 1) : cols.max() + 2]
+    box = bounds(level.hole, 1)
     hole, corner = level.hole[box], np.array([b.start for b in box])
     picture = level.channels[box][..., :3].copy()
     picture[hole] = colours[:, :3]
-    say = _say(level, field)
     sources = _sources(level, field, colours)
-
-    def wanted(where: np.ndarray, otherwise: np.ndarray, step: tuple[int, int] = (0, 0)) -> np.ndarray:
-        whole = np.zeros(level.hole.shape, bool)
-        whole[box] = where
-        return _voted(level, field, say, otherwise, whole, step)
-
-    rim = (cv2.dilate(hole.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hole & level.usable[box]
-    rim[rim] = np.abs(wanted(rim, picture[rim]) - picture[rim]).max(1) < DISAGREEMENT
+    rim = dilated(hole, 1) & ~hole & level.usable[box]
+    said = _voted(level, field, picture[rim], np.argwhere(rim) + corner)
+    rim[rim] = np.abs(said - picture[rim]).max(1) < DISAGREEMENT
     slopes = []
     for dy, dx in ((0, 1), (1, 0)):
-        slope = np.zeros_like(picture)
-        slope[: len(slope) - dy, : slope.shape[1] - dx] = np.diff(picture, axis=0 if dy else 1)
-        across = hole.copy()  # pixels whose step to the right or down begins or ends in the hole
-        across[: len(hole) - dy, : hole.shape[1] - dx] |= hole[dy:, dx:]
-        across[len(hole) - dy :], across[:, hole.shape[1] - dx :] = False, False
-        slope[across] = wanted(across, slope[across], (dy, dx))
-        copied = _copied_steps(level, sources, np.argwhere(across) + corner, (dy, dx))
-        slope[across] += COPIED * (copied - slope[across])
+        inner = np.ones_like(hole)
+        inner[len(hole) - dy :], inner[:, hole.shape[1] - dx :] = False, False
+        slope = np.where(inner[..., None], np.roll(picture, (-dy, -dx), (0, 1)) - picture, np.float32(0))
+        # pixels whose step to the right or down begins or ends in the hole
+        across = inner & (hole | np.roll(hole, (-dy, -dx), (0, 1)))
+        places = np.argwhere(across) + corner
+        voted = _voted(level, field, slope[across], places, (dy, dx))
+        slope[across] = voted + COPIED * (_copied_steps(level, sources, places, (dy, dx)) - voted)
         slopes.append(slope)
     drawn = np.where(hole, SCREENING, 0.0)
-    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture, only_hole=True).values
+    return solve_poisson(hole, rim, picture, _picture_of(*slopes), weight=drawn, anchor=picture).values[hole]
 
 
 def _copied_steps(
@@ -302,37 +241,34 @@ def _copied_steps(
 
 
 def _picture_of(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT)."""
+    """[h, w, 3]: a picture whose Laplacian is the divergence of these differences to the right and down (DCT).
+
+    There are none from the last column and row.
+    """
     import scipy.fft  # takes a twentieth of a second, which removals that fill no picture need not wait for
 
     h, w, _ = along_x.shape
-    divergence = np.zeros_like(along_x)
-    divergence[:, :-1] += along_x[:, :-1]
-    divergence[:, 1:] -= along_x[:, :-1]
-    divergence[:-1] += along_y[:-1]
-    divergence[1:] -= along_y[:-1]
+    divergence = along_x - np.roll(along_x, 1, 1) + along_y - np.roll(along_y, 1, 0)
     waves = scipy.fft.dctn(divergence, axes=(0, 1))
     eigenvalues = 2 * (np.cos(np.pi * np.arange(h) / h)[:, None] + np.cos(np.pi * np.arange(w) / w)) - 4
     eigenvalues[0, 0] = 1.0
     return scipy.fft.idctn(waves / eigenvalues[..., None], axes=(0, 1))
 
 
-def _pyramid(
-    image: np.ndarray, hole: np.ndarray, radius: int, settings: ExemplarSettings
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pyramid(image: np.ndarray, hole: np.ndarray, radius: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """(channels [h, w, 5]: colours and texture features, hole) from fine to coarse."""
     thickness = float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
     count = 1
-    while min(hole.shape) > settings.smallest * 2**count and thickness > settings.thickness * radius * 2 ** (count - 1):
+    while min(hole.shape) > SMALLEST * 2**count and thickness > THICKNESS * radius * 2 ** (count - 1):
         count += 1
     colours = image.astype(np.float32) / 255
-    levels = [(np.dstack([colours, _texture(colours, hole, 2 ** (count - 1), settings.texture)]), hole)]
+    levels = [(np.dstack([colours, _texture(colours, hole, 2 ** (count - 1))]), hole)]
     while len(levels) < count and levels[-1][1].any():
         levels.append(_halved(*levels[-1]))
     return [level for level in levels if level[1].any()]
 
 
-def _texture(colours: np.ndarray, hole: np.ndarray, window: int, weight: float) -> np.ndarray:
+def _texture(colours: np.ndarray, hole: np.ndarray, window: int) -> np.ndarray:
     """[H, W, 2] float32: mean absolute slope of luminance along x and y over a window, known pixels only."""
     grey = colours.mean(-1)
     size = (2 * window + 1, 2 * window + 1)
@@ -342,7 +278,7 @@ def _texture(colours: np.ndarray, hole: np.ndarray, window: int, weight: float) 
         valid = (~hole & ~np.roll(hole, 1, axis)).astype(np.float32)
         valid[(slice(None), 0) if axis else 0] = 0
         features.append(cv2.blur(slope * valid, size) / np.maximum(cv2.blur(valid, size), 1e-6))
-    return np.float32(np.sqrt(weight)) * np.dstack(features)
+    return np.float32(np.sqrt(TEXTURE)) * np.dstack(features)
 
 
 def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -359,14 +295,15 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _voted(
     level: _Level,
     field: NearestNeighbourField,
-    say: np.ndarray,  # [touching pixels] float64 > 0, of each patch
     otherwise: np.ndarray,  # [N, C], where nothing is voted for
-    where: np.ndarray | None = None,  # [h, w] bool, N pixels; None: the hole
+    places: np.ndarray | None = None,  # [N, 2] rows and columns; None: the hole's
     step: tuple[int, int] = (0, 0),  # vote for differences of the pixels so far down and to the right instead
 ) -> np.ndarray:
-    """What the overlapping patches say each pixel looks like, [N, C] float32."""
-    places = np.argwhere(level.hole if where is None else where)
-    weights = np.zeros(level.hole.shape)
+    """What the overlapping patches say each pixel looks like, [N, C] float32; those that fit badly have little say."""
+    places = np.argwhere(level.hole) if places is None else places
+    costs, weights = field.cost[level.touching], np.zeros(level.hole.shape)
+    poor = max(float(np.percentile(costs, 75)), 255.0**-2)
+    say = level.trust * np.maximum(np.exp(-SELECTIVE * costs / poor), LEAST_SAY)
     weights[level.touching] = np.where(field.found[level.touching], say, 0.0)
     voted = otherwise.astype(np.float32)
     parts = level.channels, places, *step, field.rows, field.cols, weights, level.radius

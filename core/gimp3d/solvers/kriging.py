@@ -2,7 +2,8 @@
 
 The picture, made small, counts as a stationary Gaussian texture with the covariance that it has round the hole: that
 knows stripes, grain and what repeats. Its mean in the hole, given the rim, is the best linear guess (simple kriging:
-Matheron 1963; of textures: Galerne and Leclaire 2017).
+Matheron 1963; of textures: Galerne and Leclaire 2017). Without weights, colours are carried inwards from the rim, and
+the variogram tells how far the truth may lie from them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ LEAST_GIVEN = 4  # px
 NUGGET = 0.02  # of the variance: what neighbours do not have in common
 NO_GUESS = 1e3  # variance where nothing is known: far above that of any colours
 ROUNDING = 2.0**-12  # of results: the solver's own hangs on the number of threads
+LEAST_BAND, BAND = 4.0, 0.5  # rim that tells what is carried inwards: px at least, and of the unknown part's depth
+LEAST_PAIRS = 100  # of pixels, that tell how colours vary at a distance
+
+# Lags 0, 1, 2, 4 … px, and half the mean squared difference of pixels that far apart, as np.interp takes them
+Variogram = tuple[list[float], list[float]]
 
 
 class Expected(NamedTuple):
@@ -30,31 +36,27 @@ class Expected(NamedTuple):
 
     def sized(self, shape: tuple[int, ...], patch: int) -> Expected:
         """At another size [h, w], and means of patches of so many px."""
-        return Expected(
-            *(cv2.blur(cv2.resize(a, shape[::-1], interpolation=cv2.INTER_AREA), (patch,) * 2) for a in self)
-        )
+        resized = (cv2.resize(a, shape[::-1], interpolation=cv2.INTER_AREA) for a in self)
+        return Expected(*(cv2.blur(a, (patch,) * 2) for a in resized))
 
 
-def expect(
-    image: np.ndarray,  # [H, W, 3], colours in [0, 1]
-    hole: np.ndarray,  # [H, W] bool, some of it
-    known: np.ndarray,  # [H, W] bool, some of it
-) -> Expected:
-    """The picture at the size that tells the hole's: detail finer than `SIDE` allows is left out."""
+def expect(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> Expected:
+    """A picture [H, W, 3] in [0, 1] at the size that tells the hole's: detail finer than `SIDE` allows is left out.
+
+    Hole and what is known are [H, W] bool, some of it each.
+    """
     height, width = hole.shape
     thickness = 2 * float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
     reach = max(LEAST_GIVEN, GIVEN * thickness)
-    rows, cols = np.nonzero(hole)
-    longest = float(max(rows.max() - rows.min(), cols.max() - cols.min()))
+    longest = max(side.stop - side.start for side in bounds(hole)) - 1
     scale = min(1.0, SIDE / (longest + 2 * reach))
     size = max(2, round(width * scale)), max(2, round(height * scale))
-
-    def small(a: np.ndarray) -> np.ndarray:
-        return cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-
-    share = small(known)
-    picture = small(image * known[..., None]) / np.maximum(share, 1e-3)[..., None]
-    there, unknown = share > 0.5, (small(hole) > 0) & (share <= 0.5)
+    share, total, open_ = (
+        cv2.resize(a.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        for a in (known, image * known[..., None], hole)
+    )
+    picture, there = total / np.maximum(share, 1e-3)[..., None], share > 0.5
+    unknown = (open_ > 0) & ~there
     away = cv2.distanceTransform((~unknown).astype(np.uint8), cv2.DIST_L2, 5)
     variance = np.where(unknown, np.float32(NO_GUESS), np.float32(0))
     if unknown.any() and there.any():
@@ -63,11 +65,8 @@ def expect(
         given = there & (away <= begins + max(LEAST_GIVEN, reach * scale))
         window = bounds(near | unknown)
         picture[unknown], variance[unknown] = _kriged(*(a[window] for a in (picture, unknown, given, near)))
-
-    def large(a: np.ndarray) -> np.ndarray:
-        return cv2.resize(a, (width, height), interpolation=cv2.INTER_LINEAR)
-
-    return Expected(large(picture), np.where(known, 0, large(variance)))
+    colours, variance = (cv2.resize(a, (width, height), interpolation=cv2.INTER_LINEAR) for a in (picture, variance))
+    return Expected(colours, np.where(known, 0, variance))
 
 
 def _kriged(
@@ -95,3 +94,58 @@ def _kriged(
     values = scipy.linalg.solve_triangular(lower, picture[given] - mean, lower=True)
     found, variance = mean + across.T @ values, np.maximum(own - (across**2).sum(0), 0)
     return ROUNDING * np.rint(found / ROUNDING), ROUNDING**2 * np.rint(variance / ROUNDING**2)
+
+
+def foretell(picture: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Variogram]:
+    """The rim's colours carried inwards [H, W, 3], the variance of the true ones about them [H, W], and the variogram.
+
+    The picture is [H, W, 3] float32, `known` [H, W] bool. At a distance from the rim, the variance is the rim's own
+    semivariance at that lag.
+    """
+    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
+    depth = float(away.max())
+    outwards = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 5)
+    rim = known & (outwards <= max(LEAST_BAND, BAND * depth))
+    lags = variogram(picture, rim, depth)
+    variance = np.where(known, 0, np.interp(away, *lags)).astype(np.float32)
+    return np.where(known[..., None], picture, carried(picture, rim)), variance, lags
+
+
+def variogram(picture: np.ndarray, known: np.ndarray, reach: float) -> Variogram:
+    """Of a picture's [H, W, C] known pixels [H, W] bool, to twice a reach in px; the semivariance never falls."""
+    lags, found = [0.0], [0.0]
+    (height, width), lag = known.shape, 1
+    while lag < 2 * reach and lag < max(height, width):
+        slant = max(1, round(lag / 2**0.5))
+        total, count = 0.0, 0
+        for down, right in ((0, lag), (lag, 0), (slant, slant), (slant, -slant)):
+            if down >= height or abs(right) >= width:
+                continue
+            here = slice(0, height - down), slice(max(0, -right), width - max(0, right))
+            there = slice(down, height), slice(max(0, right), width + min(0, right))
+            both = known[here] & known[there]
+            total += float(((picture[here][both] - picture[there][both]) ** 2).mean(-1).sum())
+            count += int(both.sum())
+        if count >= LEAST_PAIRS:
+            lags.append(float(lag))
+            found.append(max(found[-1], total / count / 2))
+        lag *= 2
+    return lags, found
+
+
+def carried(picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The known colours, [H, W] bool, of a picture [H, W, 3] float32, and coarser means of them where there are none.
+
+    Push-pull (Grossman 1998); float32.
+    """
+    weight = known.astype(np.float32)
+    levels = [(picture * weight[..., None], weight)]
+    while max(levels[-1][1].shape) > 1:
+        half = [-(-side // 2) for side in levels[-1][1].shape[::-1]]
+        levels.append(tuple(cv2.resize(a, half, interpolation=cv2.INTER_AREA) for a in levels[-1]))
+    total, weight = levels.pop()
+    colour = total / max(1e-9, float(weight[0, 0]))
+    for total, weight in reversed(levels):
+        coarse = cv2.resize(colour, weight.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        colour = total + (1 - weight[..., None]) * coarse
+    return colour

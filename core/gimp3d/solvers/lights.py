@@ -51,22 +51,15 @@ class Shading:
     def make(cls, surfaces: Sequence[LitSurface], levels: Sequence[int], bent: bool = True) -> Shading:
         """`levels` are sides of blocks, in texels; `bent`: light may change over a surface as a quadratic does.
 
-        A light nearby makes that, and it is no shadow. But wide shadows of the sky look like it: to measure those,
-        light must not be bent.
+        A light nearby makes that, and is no shadow; but wide shadows of the sky, to be measured, look like it.
         """
-        operators, besides, groups = [], [], []
-        for number, surface in enumerate(surfaces):
-            operator, group = _differences(surface.shown, levels)
-            operators.append(operator)
-            groups.append(group + 1000 * number)
-            besides.append(_besides(surface, bent))
+        operators, groups = zip(*(_differences(s.shown, levels) for s in surfaces))
         operator = sparse.block_diag(operators).tocsr()
-        group = np.concatenate(groups)
+        group = np.concatenate([kinds + 1000 * number for number, kinds in enumerate(groups)])
         colours = np.concatenate([s.colours[s.shown] for s in surfaces])
-        luminance = np.log(np.exp(colours).mean(1))
-        observed = operator @ luminance
+        observed = operator @ np.log(np.exp(colours).mean(1))  # of luminance
         hues = operator @ colours - observed[:, None]
-        other = operator @ scipy.linalg.block_diag(*besides)
+        other = operator @ scipy.linalg.block_diag(*(_besides(s, bent) for s in surfaces))
         noise = _usual(observed - other @ _explained(observed, other, group), group)
         colourful = np.abs(hues).max(1)
         weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
@@ -75,18 +68,13 @@ class Shading:
         other = scipy.linalg.solve_triangular(root, other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
-    def fit(
-        self,
-        shadows: np.ndarray,  # [T, S]
-        least: np.ndarray | float = 0.0,  # [S] of strengths
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Strengths of shadows, coefficients of what is besides [B], and the loss that is left.
+    def fit(self, shadows: np.ndarray, least: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray, float]:
+        """Strengths [S], no less than the least, of shadows [T, S]; coefficients of what is besides [B]; the loss left.
 
         Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
         count, shadows = shadows.shape[1], shadows.astype(np.float64)
-        x = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
-        x[:count] = least
+        x = np.concatenate([np.full(count, least), self.besides.T @ (self.weight * self.observed / self.noise**2)])
         low = np.concatenate([x[:count], np.full(len(x) - count, -np.inf)])
         high = np.where(np.isfinite(low), 1.0, np.inf)
         loss = self.loss(self.residual(shadows @ x[:count], x[count:]))

@@ -21,8 +21,7 @@ from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import any_between, fma16, load1, load16, splat16, store16, sum16
 from ..compute.threads import parallel_map
 from ..schema import AtLeastOne, Seed
-from .patch_index import NO_TREE, PatchIndex, index_patches, leaf_of
-from .patches import Patches, coordinates, lay_out
+from .patches import NO_TREE, Components, Patches, Tree, coordinates, index_patches, lay_out, leaf_of
 
 MOST_BANDS = 16
 BAND_ROWS = 8  # px; thinner bands would slow propagation down, which crosses a band's edge once per sweep
@@ -68,17 +67,19 @@ def nearest_neighbour_field(
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most.
 
-    Minimises (1 − λ_s)·appearance + λ_s·spatial + penalty (paper eq. 8). Appearance is the mean squared
-    difference over the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and
-    scaled to [0, 1] (PixMix, Herling & Broll 2014). A source patch lies inside the image and holds no target
-    pixel; where the image has no room for one, patches shrink. Between equal sources the nearest wins.
+    Minimises (1 − λ_s)·appearance + λ_s·spatial + penalty (paper eq. 8). Appearance is the mean squared difference over
+    the patch; spatial is the neighbours' mean squared deviation of offsets, truncated and scaled to [0, 1] (PixMix,
+    Herling & Broll 2014). A source patch lies inside the image and holds no target pixel; where there is no room for
+    one, patches shrink. Between equal sources the nearest wins.
     """
     radius = settings.patch // 2
     while not (allowed := source & patch_centres(~target, radius)).any() and radius > 0:
         radius -= 1
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
-    return refined(None, patches, target, allowed, settings, penalty, index)
+    rows, cols = np.full((2, *target.shape), -1, np.int32)
+    nothing = NearestNeighbourField(rows, cols, np.zeros(target.shape, np.float32), radius)
+    return refined(nothing, patches, target, allowed, settings, penalty, index)
 
 
 def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
@@ -87,36 +88,41 @@ def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
     return cv2.erode(usable.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-def upsampled(field: NearestNeighbourField, target: np.ndarray) -> NearestNeighbourField:
-    """The field at twice the resolution, that of `target`: f ← 2·f plus the pixel's parity; its cost is not known
-    yet."""
+def upsampled(field: NearestNeighbourField, target: np.ndarray, allowed: np.ndarray) -> NearestNeighbourField:
+    """The field at twice the resolution, that of `target`: f ← 2·f plus the pixel's parity, where that is allowed.
+
+    Its cost is not known yet.
+    """
     h, w = target.shape
-    y, x = np.nonzero(target & (field.rows.repeat(2, 0).repeat(2, 1)[:h, :w] >= 0))
+    y, x = np.nonzero(target & field.found.repeat(2, 0).repeat(2, 1)[:h, :w])
+    v = np.minimum(2 * field.rows[y // 2, x // 2] + (y & 1), h - 1)
+    u = np.minimum(2 * field.cols[y // 2, x // 2] + (x & 1), w - 1)
+    kept = allowed[v, u]
     rows, cols = np.full((2, h, w), -1, np.int32)
-    rows[y, x] = np.minimum(2 * field.rows[y // 2, x // 2] + (y & 1), h - 1)
-    cols[y, x] = np.minimum(2 * field.cols[y // 2, x // 2] + (x & 1), w - 1)
+    rows[y[kept], x[kept]], cols[y[kept], x[kept]] = v[kept], u[kept]
     return NearestNeighbourField(rows, cols, np.zeros((h, w), np.float32), field.radius)
 
 
 def refined(
-    field: NearestNeighbourField | None,  # a first guess; where it has no allowed source the nearest one is tried
+    field: NearestNeighbourField,  # a first guess; where it has no allowed source the nearest one is tried
     patches: Patches,
     target: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, source patch centres
     settings: PatchMatchSettings,
     penalty: np.ndarray | None = None,  # [H, W] float32
-    index: PatchIndex | None = None,  # of allowed patches; without one `reach` should be far
+    index: tuple[Components, Tree] | None = None,  # of allowed patches
     guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
-    reach: int = REACH,  # px, of the random search
     tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
-    rows, cols = np.full((2, h, w), -1, np.int32)
-    cost = np.zeros((h, w), np.float32)
+    (rows, cols), cost = np.full((2, h, w), -1, np.int32), np.zeros((h, w), np.float32)
     if not allowed.any() or not target.any():
         return NearestNeighbourField(rows, cols, cost, patches.radius)
-    start = _first_guess(field, target, allowed)
+    kept, start = field.found & target, np.stack([field.rows, field.cols])
+    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
+    if (kept != target).any():
+        start = np.where(kept, start, nearest_allowed(allowed))
     extra = np.zeros((h, w), np.float32) if penalty is None else penalty.astype(np.float32)
     guides = np.empty((h, w, 0), np.float32) if guides is None else guides
     weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
@@ -124,7 +130,8 @@ def refined(
     number[wanted] = np.arange(len(wanted[0]))
     tree, looks = NO_TREE, np.empty(0, np.float32)
     if index is not None:
-        tree, looks = index.tree, coordinates(patches, index.components, patches.starts(*wanted)).ravel()
+        components, tree = index
+        looks = coordinates(patches, components, patches.starts(*wanted)).ravel()
     # Bands hold about as many target pixels each; they depend on nothing else.
     per_row = np.cumsum(target.sum(1))
     count = min(MOST_BANDS, max(1, int(target.any(1).sum()) // BAND_ROWS))
@@ -134,25 +141,11 @@ def refined(
         arguments = (
             target, allowed, *patches, extra, *weights, guides,
             *tree, index is not None and sweep < tree_sweeps, looks, number,
-            *start, sweep == 0, sweep % 2 == 0, reach, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
+            *start, sweep == 0, sweep % 2 == 0, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
         parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
     return NearestNeighbourField(rows, cols, cost, patches.radius)
-
-
-def _first_guess(
-    field: NearestNeighbourField | None, target: np.ndarray, allowed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The field where its sources are allowed, elsewhere the nearest allowed ones."""
-    if field is None:
-        return nearest_allowed(allowed)
-    kept = field.found & target
-    kept[kept] = allowed[field.rows[kept], field.cols[kept]]
-    if (kept == target).all():
-        return field.rows, field.cols
-    rows, cols = nearest_allowed(allowed)
-    return np.where(kept, field.rows, rows), np.where(kept, field.cols, cols)
 
 
 def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -179,14 +172,12 @@ def _sweep_band(
     target, allowed, values, stride, channels, radius, row_weights, penalty,
     weight, coherence, truncation, tie, guides,
     features, tree_rows, tree_cols, split_component, split_value, grid, grid_step, in_leaves, looks, number,
-    start_rows, start_cols, first, downward, reach, random, old_rows, old_cols, rows, cols, cost, band,
+    start_rows, start_cols, first, downward, random, old_rows, old_cols, rows, cols, cost, band,
 ):  # fmt: skip
-    """One sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones
-    near.
+    """A sweep over a band's rows [lo, hi): candidates are neighbours' sources, shifted, their leaves, and random ones.
 
-    The first sweep begins with `start` and each patch's own leaf. Neighbours in this band are up to date, others
-    are as the last sweep left them. A candidate's cost is found in one place, written out: a helper that takes
-    arrays would count references for each.
+    The first sweep begins with `start` and each patch's own leaf. A candidate's cost is found in one place, written
+    out: a helper that takes arrays would count references for each.
     """
     (lo, hi), (h, w) = band, target.shape
     size, step, salt = 2 * radius + 1, 1 if downward else -1, _hash(random)
@@ -206,7 +197,7 @@ def _sweep_band(
                 v, u = int64(rows[y, x]), int64(cols[y, x])
             state = _hash(uint32(y * w + x) ^ salt)
             best, own = float32(1e30), float32(0)
-            turn, block, lane, span = 0, 0, 16, reach
+            turn, block, lane, span = 0, 0, 16, REACH
             while True:
                 bound = float32(0)
                 if turn == 0:

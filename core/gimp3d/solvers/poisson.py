@@ -26,11 +26,11 @@ AXES = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))  # pixels and th
 
 @dataclass(frozen=True)
 class PoissonSolution:
-    """A filled array, or only the M pixels of the hole, in the order of array[hole]."""
+    """A filled array."""
 
-    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced; or [M] or [M, C]
+    values: np.ndarray  # [H, W] or [H, W, C], the input with the hole replaced
     iterations: int  # most of any channel
-    unanchored: np.ndarray  # [H, W] or [M] bool, hole pixels of components that touch no known pixel
+    unanchored: np.ndarray  # [H, W] bool, hole pixels of components that touch no known pixel
 
 
 def solve_poisson(
@@ -42,41 +42,34 @@ def solve_poisson(
     *,
     weight: np.ndarray | None = None,  # [H, W] ≥ 0, how strongly each pixel is drawn to `anchor` (or to 0)
     anchor: np.ndarray | None = None,  # like values, soft data (screened Poisson)
-    only_hole: bool = False,  # for large images with small holes: nothing else is made and returned
 ) -> PoissonSolution:
     """Solve Σ_q (u(q) − u(p)) + w(p)(a(p) − u(p)) = Σ_q (g(q) − g(p)) over the 4-neighbours q of p in hole ∪ known.
 
     This is paper 3.3 with its sign mended (docs/method.md): the solution's gradients are the guidance's, not their
     opposites. Neighbours that are neither hole nor known, and the image's border, are natural (Neumann): they are
-    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels that are
-    not finite are not known; weights and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the
-    most.
+    dropped on both sides. A pair of pixels of which one has no finite guidance wants no gradient; known pixels, weights
+    and anchors that are not finite do not count, nor weights below 1e-30; 1e30 is the most.
 
-    A component of the hole that touches no known pixel (and is drawn to no anchor) is reported as unanchored. It takes
-    the guidance as it is: that has the wanted gradients and settles the free constant. Where there is none, it is NaN.
+    A component of the hole that touches no known pixel (and is drawn to no anchor) is unanchored: it takes the guidance
+    as it is, which settles the free constant. Where there is none, it is NaN.
     """
     hole = np.asarray(hole, bool)
-    if not hole.any():
-        filled = np.array(values, dtype=np.float64)
-        return PoissonSolution(filled[hole] if only_hole else filled, 0, np.zeros(0 if only_hole else hole.shape, bool))
     window = bounds(hole, 1)
 
     def cut(array: np.ndarray) -> np.ndarray:
         part = np.pad(np.asarray(array)[window], ((1, 1), (1, 1), *[(0, 0)] * (np.ndim(array) - 2)))
         return part if part.dtype == bool else part.astype(np.float64).reshape(*part.shape[:2], -1)
 
-    fixed, guide = cut(values), None if guidance is None else cut(guidance)
+    fixed = cut(values)
+    guide = np.full(fixed.shape, np.nan) if guidance is None else cut(guidance)
     aim = np.zeros(fixed.shape) if anchor is None else cut(anchor)
     pull = np.zeros(fixed.shape[:2]) if weight is None else cut(weight)[..., 0]
     pull[~((pull > LEAST_WEIGHT) & np.isfinite(pull) & np.isfinite(aim).all(-1))] = 0
     aim[pull == 0] = 0
     task = _Task(cut(hole), cut(np.asarray(known, bool)), fixed, guide, np.minimum(pull, MOST_WEIGHT), aim)
     found, iterations, loose = _solve(task, tolerance)
-    inside, loose = found[task.hole].reshape(-1, *np.shape(values)[2:]), loose[task.hole]
-    if only_hole:
-        return PoissonSolution(inside, iterations, loose)
     filled, unanchored = np.array(values, dtype=np.float64), np.zeros(hole.shape, bool)
-    filled[hole], unanchored[hole] = inside, loose
+    filled[hole], unanchored[hole] = found[task.hole].reshape(-1, *np.shape(values)[2:]), loose[task.hole]
     return PoissonSolution(filled, iterations, unanchored)
 
 
@@ -86,15 +79,15 @@ class _Task(NamedTuple):
     hole: np.ndarray  # [h, w] bool
     known: np.ndarray  # [h, w] bool
     values: np.ndarray  # [h, w, C]
-    guidance: np.ndarray | None  # [h, w, C]
+    guidance: np.ndarray  # [h, w, C], NaN where there is none
     pull: np.ndarray  # [h, w]
     anchor: np.ndarray  # [h, w, C]
 
 
 def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
     """[h, w, C] of the hole, the iterations taken, and what is unanchored [h, w] bool."""
-    hole, known = task.hole, task.known & ~task.hole & np.isfinite(task.values).all(-1)
-    given = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
+    hole, given = task.hole, task.guidance
+    known = task.known & ~hole & np.isfinite(task.values).all(-1)
     guided, values = np.isfinite(given), np.where(known[..., None], task.values, 0)
     # SIGN OF THE GUIDANCE: u = + guidance + a constant for each part of the hole + what is solved for.
     start = np.where(guided & hole[..., None], given, 0)
@@ -136,13 +129,13 @@ def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
 
 def _settled(task: _Task, loose: np.ndarray, parts: np.ndarray, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
     """Unanchored parts take their guidance, the rest is solved; pixels without guidance hang on those with."""
-    guidance = np.full(task.values.shape, np.nan) if task.guidance is None else task.guidance
-    taken = loose & np.isfinite(guidance).all(-1)
+    taken = loose & np.isfinite(task.guidance).all(-1)
     lost = loose & (np.bincount(parts.ravel(), taken.ravel()) == 0)[parts]
-    values = np.where(taken[..., None], guidance, task.values)
+    values = np.where(taken[..., None], task.guidance, task.values)
     hole, known = task.hole & ~taken & ~lost, (task.known & ~loose) | taken
     result, iterations, _ = _solve(task._replace(hole=hole, known=known, values=values), tolerance)
-    return np.where(taken[..., None], guidance, np.where(lost[..., None], np.nan, result)), iterations, loose
+    result[taken], result[lost] = task.guidance[taken], np.nan
+    return result, iterations, loose
 
 
 class _Grid(NamedTuple):

@@ -7,13 +7,14 @@ hole, it also tells what is in it (offset statistics of He & Sun 2012, with rota
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..geometry import colours_at
+from ..geometry import colours_at, dilated
 
 SIDE = 96  # px: pictures are shrunk to this to find motions in
 ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms
@@ -38,14 +39,11 @@ class Motion:
     misfit: float  # RMS grey levels of what is not explained
 
 
-def find_motions(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool, what the picture shows well
-) -> tuple[Motion, ...]:
-    """The motions that explain what is round the hole, best first; none in most pictures.
+def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[Motion, ...]:
+    """The motions that explain what is round a picture's hole, best first; none in most pictures.
 
-    Reflections are asked where nothing turns or repeats: what has both tells by either.
+    The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool. Reflections are asked where
+    nothing turns or repeats: what has both tells by either.
     """
     scale = min(1.0, SIDE / max(hole.shape))
     size = (max(1, round(hole.shape[1] * scale)), max(1, round(hole.shape[0] * scale)))
@@ -73,12 +71,9 @@ def find_motions(
 
 
 def continue_regularly(
-    image: np.ndarray,  # [H, W, 3] uint8
-    hole: np.ndarray,  # [H, W] bool
-    known: np.ndarray,  # [H, W] bool
-    motions: tuple[Motion, ...],
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray, motions: tuple[Motion, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture with what motions tell of the hole, and which of its pixels [H, W] bool they tell of."""
+    """The picture with what motions, see find_motions, tell of the hole, and of which of its pixels [H, W] bool."""
     filled, left = image.copy(), hole.copy()
     for motion in motions:
         rows, cols = np.nonzero(left)
@@ -86,8 +81,7 @@ def continue_regularly(
             break
         y, x = _mapped(motion.turn, motion.shift, rows, cols)
         tells = _sample(known.astype(np.float32), y, x) > 0.999
-        colours = _sample(image, y[tells], x[tells], cv2.INTER_CUBIC)
-        filled[rows[tells], cols[tells]] = colours
+        filled[rows[tells], cols[tells]] = _sample(image, y[tells], x[tells], cv2.INTER_CUBIC)
         left[rows[tells], cols[tells]] = False
     return filled, hole & ~left
 
@@ -165,9 +159,8 @@ def _settled(
     mirrored: bool,
     shift: np.ndarray,
 ) -> Motion | None:
-    """The motion nearby that explains most (pattern search: Hooke 1961), if that is enough; it turns about the hole."""
-    beside = known & (cv2.dilate(hole.astype(np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0)
-    ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (beside, 4000)))
+    """The motion nearby that explains most, if that is enough; it turns about the hole."""
+    ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (known & dilated(hole, RIM), 4000)))
     shows = known.astype(np.float32)
     middle = np.argwhere(hole).mean(0)
     target = _turn(angle, mirrored) @ middle + shift
@@ -186,23 +179,27 @@ def _settled(
         rest = ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1).mean()
         return 1 - float(rest) / (2 * max(_variance(image, of), PLAIN))
 
-    values, step = np.zeros(3), 1.0
-    best = explained(values)
-    while step > 0.1:
-        moves = [
-            values + step * sign * np.eye(3)[k] for k in range(0 if angle or mirrored else 1, 3) for sign in (1, -1)
-        ]
-        told = [explained(m) for m in moves]
-        if max(told) > best:
-            values, best = moves[int(np.argmax(told))], max(told)
-        else:
-            step /= 2
+    values, best = pattern_search(explained, np.eye(3)[0 if angle or mirrored else 1 :])
     y, x = _mapped(*at(values), *inside)
     tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
     # where something ends at the hole, only its rim contradicts; where it is plain, something far off is explained
     if not tells or min(best, explained(values, rim, 0)) < EXPLAINED:
         return None
     return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * _variance(image, ring) / 3))
+
+
+def pattern_search(score: Callable[[np.ndarray], float], axes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Values [N] near 0 with the best score, and that; steps of 1 to 0.1 along axes [K, N] are tried (Hooke 1961)."""
+    values, step = np.zeros(axes.shape[1]), 1.0
+    best = score(values)
+    while step > 0.1:
+        moves = [values + step * sign * axis for axis in axes for sign in (1, -1)]
+        scores = [score(m) for m in moves]
+        if max(scores) > best:
+            values, best = moves[int(np.argmax(scores))], max(scores)
+        else:
+            step /= 2
+    return values, best
 
 
 def _thinned(where: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

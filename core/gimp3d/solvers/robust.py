@@ -1,4 +1,4 @@
-"""Linear least squares that outliers do not spoil."""
+"""Linear least squares, and differences in colour, that outliers do not spoil."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 
 CUT = 4.685  # σ beyond which an equation counts for nothing: Tukey's biweight at 95 % efficiency
 ROUNDS = 20  # of reweighting
+COLOUR_CUT = 3.0  # robust standard deviations beyond which a pair of colours counts for nothing
+LEAST_NOISE = 1.0  # grey levels
 
 
 def robust_fit(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
@@ -23,3 +25,20 @@ def robust_fit(rows: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]
         # weights of the equations, whose squares are those of the squared residuals
         weight = np.maximum(1 - (residual / (CUT * sigma + exact)) ** 2, 0)
     return x, sigma
+
+
+def exposure_gain(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """[3] exposure of the second grey levels [N, 3] over the first ones', by well exposed pairs; 1 where few are."""
+    exposed = ((before > 16) & (after > 16) & (before < 250) & (after < 250)).T
+    ratios = [after[where, c] / before[where, c].astype(np.float64) for c, where in enumerate(exposed)]
+    return np.array([np.median(r) if len(r) >= 50 else 1.0 for r in ratios])
+
+
+def biweight(residuals: np.ndarray, tolerance: float) -> np.ndarray:
+    """[N] in [0, 1]: how much residuals [N, 3], in grey levels, count: Tukey's biweight, scaled by their median length.
+
+    `tolerance` is in COLOUR_CUT.
+    """
+    squares = np.einsum("nc,nc->n", residuals, residuals)
+    scale = tolerance * COLOUR_CUT * (1.4826 * np.sqrt(np.median(squares)) + LEAST_NOISE)
+    return np.maximum(0.0, 1 - squares / scale**2) ** 2

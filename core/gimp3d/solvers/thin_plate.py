@@ -21,7 +21,7 @@ STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one b
 OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
 
 
-def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unknowns: int = UNKNOWNS) -> np.ndarray:
+def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
 
     `weight` [H, W] ≥ 0 is how much each value counts, 0 = unknown; `wanted` [H, W] bool where it is asked for.
@@ -42,7 +42,7 @@ def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray, unkno
     slope = np.linalg.lstsq(points * root[:, None], values[window][rows, cols] * root, rcond=None)[0]
     y, x = np.indices(domain.shape)
     trend = slope[0] * y + slope[1] * x + slope[2]
-    stride = int(np.ceil(np.sqrt(domain.sum() / unknowns)))
+    stride = int(np.ceil(np.sqrt(domain.sum() / UNKNOWNS)))
     count = _cells(weight, stride)
     mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
     cells = _cells(domain.astype(np.float64), stride) > 0

@@ -12,7 +12,7 @@ from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SOLID
 from ..raster import render_bytes
-from ..solvers.colours import exposure_gain
+from ..solvers.robust import exposure_gain
 from .masks import ViewMasks
 
 LEAST_REACH = 24  # px round what the object touched that are compared, at least

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..camera import Camera
-from ..compute.jit import exact_kernel
-from ..compute.threads import run_ranges
-from ..geometry import SAME_DEPTH, pack_camera, project
+from ..geometry import SAME_DEPTH, surface_points
 from ..schema import Signed
 from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
+from .witness import Says, Witness, ask, total_over
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 
@@ -32,7 +31,6 @@ class MappingField:
 
     rows: np.ndarray  # [H, W] int32, -1 where there is none
     cols: np.ndarray  # [H, W] int32
-    cost: np.ndarray  # [H, W] float32, (1 − λ_s)·appearance + λ_v (1 − v)
     confidence: float
     reason: str
 
@@ -42,17 +40,17 @@ def source_visibility(
     depth: np.ndarray,  # [H, W] z-depth of the reference, 0 = nothing
     views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, hidden pixels)
 ) -> np.ndarray:
-    """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden.
+    """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden."""
+    rows, cols, points = surface_points(camera, np.where(np.isfinite(depth), depth, 0))
 
-    One pass per view; nothing is kept of a view but its count.
-    """
-    count = np.zeros(depth.shape, np.int32)
-    here, back = np.ascontiguousarray(depth, np.float32), np.linalg.inv(camera.viewmat)
-    for other, z, hidden in views:
-        as_seen = pack_camera(replace(other, viewmat=other.viewmat @ back))  # from the reference's axes
-        there = np.ascontiguousarray(z, np.float32), np.ascontiguousarray(hidden, bool)
-        run_ranges(_count_seen, len(depth), here, np.linalg.inv(camera.K), as_seen, *there, SAME_DEPTH, count)
-    return (count / max(1, len(views))).astype(np.float32)
+    def shown(view: tuple[Camera, np.ndarray, np.ndarray]) -> np.ndarray:
+        other, z, hidden = view
+        witness = Witness(other, np.empty((0, 0, 3), np.uint8), hidden, np.zeros_like(hidden), z)
+        return ask([witness], points, SAME_DEPTH)[0] == Says.SEEN
+
+    share = np.zeros(depth.shape, np.float32)
+    share[rows, cols] = total_over(views, shown, rows.shape) / max(1, len(views))
+    return share
 
 
 def mapping_field(
@@ -85,7 +83,7 @@ def mapping_field(
         confidence = float(np.exp(-misfit / MISFIT))
         reason = f"fill explained to {misfit:.1f} grey levels; "
         reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
-    return MappingField(nearest.rows, nearest.cols, nearest.cost, confidence, reason)
+    return MappingField(nearest.rows, nearest.cols, confidence, reason)
 
 
 def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
@@ -97,24 +95,3 @@ def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> Near
     rows, cols = np.full((2, *source.shape), -1, np.int32)
     rows[tuple(places[kept].T)], cols[tuple(places[kept].T)] = moved[kept].T
     return replace(nearest, rows=rows, cols=cols)
-
-
-@exact_kernel
-def _count_seen(lo, hi, depth, inverse, other, there, hidden, tolerance, count):
-    """Add one to every pixel of rows [lo, hi) whose point is the surface that the other view shows there.
-
-    `inverse` is K⁻¹ of the reference, `other` the packed view in its camera axes.
-    """
-    for i in range(lo, hi):
-        for j in range(depth.shape[1]):
-            z = float(depth[i, j])
-            if not 0 < z < np.inf:
-                continue
-            x = (inverse[0, 0] * (j + 0.5) + inverse[0, 2]) * z
-            y = (inverse[1, 1] * (i + 0.5) + inverse[1, 2]) * z
-            u, v, seen = project(other, x, y, z)
-            if not (0 <= u < other[16] and 0 <= v < other[17]):
-                continue
-            a, b = int(v), int(u)
-            if not hidden[a, b] and abs(there[a, b] - seen) < tolerance * seen:
-                count[i, j] += 1

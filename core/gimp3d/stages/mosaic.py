@@ -22,17 +22,15 @@ def mosaic(
     witnesses: Sequence[Witness],
     said: np.ndarray,  # [V, H, W], see ask
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best.
+    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best; 0 of none.
 
-    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: light
-    differs between photos on any surface, but things that do not lie on it also show another texture in each. And how
-    loud the texture is that most of them show, likewise: a loud one differs more where photos are a little misplaced.
+    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: things
+    that do not lie on the surface show another texture in each, whatever the light. And how loud the texture is that
+    most of them show, likewise: a loud one differs more where photos are a little misplaced.
 
-    Where photos disagree (light, what their depth does not tell, a rest of the object), the median of each channel
-    decides. Its detail is blurred by whatever photos are misplaced, so detail comes from one photo at a time, brought
-    to the median's colours by a smooth correction: the one with most pixels there of those that need little of it.
-    Between photos only detail changes, so that no seam shows (two bands of Burt & Adelson 1983). 0 where no photo
-    shows the surface.
+    Where photos disagree, the median of each channel decides. As misplaced photos blur its detail, that comes from one
+    photo at a time, brought to the median's colours by a smooth correction: the one with most pixels there of those
+    that need little of it. So no seam shows between photos (two bands of Burt & Adelson 1983).
     """
     h, w = points.shape[:2]
     clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do
@@ -77,26 +75,20 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 def _agree_range(lo, hi, samples, textures, density, middle, spread, loud):
     values = np.empty(len(samples))
     for i in range(lo, hi):
-        count = 0
-        for channel in range(3):
+        for channel in range(4):  # the fourth is texture
             count = 0
             for k in range(len(samples)):
                 if density[k, i] > 0:
-                    values[count] = samples[k, i, channel]
+                    values[count] = samples[k, i, channel] if channel < 3 else textures[k, i]
                     count += 1
-            if count:
-                part = np.sort(values[:count])
+            if count == 0:
+                break
+            part = np.sort(values[:count])
+            if channel < 3:
                 middle[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
-        if count == 0:
-            continue
-        count = 0
-        for k in range(len(samples)):
-            if density[k, i] > 0:
-                values[count] = textures[k, i]
-                count += 1
-        part = np.sort(values[:count])
-        loud[i] = 0.5 * abs(part[count // 2])
-        spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
+            else:
+                loud[i] = 0.5 * abs(part[count // 2])
+                spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
 
 
 @exact_kernel

@@ -20,7 +20,7 @@ from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import SAME_DEPTH, colours_at, framed, sees
 from ..raster import drawing, render
-from ..solvers.variogram import at_lag, foretell, variogram
+from ..solvers.kriging import foretell, variogram
 from .charts import Chart, Hits
 from .masks import ViewMasks
 from .propagate import Reference
@@ -295,7 +295,7 @@ def _sampled(
     unknown = object_ & ~told & ~by_picture
     expected[unknown] = foretold[unknown]
     if given is not None:
-        variance += by_picture * 2 * at_lag(lags, _shift(look, thin, points, surface, given.camera) / step)
+        variance += by_picture * 2 * np.interp(_shift(look, thin, points, surface, given.camera) / step, *lags)
     return _Sample(
         object_, ring & told, photo, look.before[thin], look.after[thin], expected, variance, told, by_picture, points
     )
@@ -334,7 +334,7 @@ def _height_doubt(chart: Chart) -> np.ndarray:
     if chart.kind != "plane" and chart.known.any():
         away = cv2.distanceTransform((~chart.known).astype(np.uint8), cv2.DIST_L2, 5)
         lags = variogram(chart.depth[..., None], chart.known, float(away[chart.hole].max(initial=0)))
-        variance += at_lag(lags, away)
+        variance += np.interp(away, *lags)
     return np.sqrt(variance).astype(np.float32)
 
 

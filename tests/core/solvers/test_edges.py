@@ -146,6 +146,6 @@ def test_a_straight_border_stays_straight_through_a_large_hole(seed: int) -> Non
     truth = textured(np.where(side_of(62, 4) > 0, 150.0, 110.0), 14, 2.0, seed)
     truth[..., 0] = np.where(side_of(62, 4) > 0, truth[..., 0], truth[..., 0] // 2)
     hole = (np.abs(side_of(62, 0)) < 35) & (np.abs(side_of(152, 0)) < 60)
-    filled = complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole).image.astype(int)
+    filled = complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole)[0].astype(int)
     wrong = hole & ((filled[..., 1] - filled[..., 0] < 20) != (side_of(62, 4) > 0)) & (np.abs(side_of(62, 4)) > 2)
     assert wrong.sum() < 0.005 * hole.sum()

@@ -7,14 +7,14 @@ import pytest
 from structured import edge_error, structured
 
 from gimp3d.evaluate.metrics import psnr
-from gimp3d.solvers.exemplar import ExemplarSettings, complete_picture
+from gimp3d.solvers.exemplar import complete_picture
 
 PICTURES = structured()
 
 
 def filled(name: str, seed: int = 0) -> np.ndarray:
     truth, hole = PICTURES[name]
-    return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, ExemplarSettings(seed=seed)).image
+    return complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole, seed=seed)[0]
 
 
 @pytest.mark.parametrize("name", [name for name in PICTURES if name != "rug"])
@@ -50,7 +50,7 @@ def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
     fills = []
     for rubbish in (0, 255):
         picture = np.where((hole | unknown)[..., None], np.uint8(rubbish), truth)
-        done = complete_picture(picture, hole, unknown=unknown).image
+        done = complete_picture(picture, hole, unknown=unknown)[0]
         assert (done[~hole] == picture[~hole]).all()
         fills.append(done[hole])
     assert (fills[0] == fills[1]).all()

@@ -192,7 +192,7 @@ def test_an_empty_target_gives_an_empty_field() -> None:
 def test_upsampling_doubles_coordinates_and_keeps_parity() -> None:
     rows, cols = np.full((2, 3, 4), -1, np.int32)
     rows[1, 1], cols[1, 1] = 2, 3
-    fine = upsampled(NearestNeighbourField(rows, cols, np.zeros((3, 4), np.float32), 2), np.ones((6, 7), bool))
+    fine = upsampled(NearestNeighbourField(rows, cols, np.zeros((3, 4), np.float32), 2), *np.ones((2, 6, 7), bool))
     assert fine.found.sum() == 4
     assert fine.rows[2:4, 2:4].tolist() == [[4, 4], [5, 5]]
     assert fine.cols[2:4, 2:4].tolist() == [[6, 6], [6, 6]]  # the seventh column is the last one

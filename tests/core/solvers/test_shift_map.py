@@ -56,7 +56,7 @@ def test_texture_is_as_loud_in_the_hole_as_round_it() -> None:
     truth = np.clip(128 + grain[..., None].repeat(3, 2), 0, 255).astype(np.uint8)
     hole = np.zeros(truth.shape[:2], bool)
     hole[60:100, 70:130] = True
-    filled = complete_picture(truth, hole).image.astype(np.float32)
+    filled = complete_picture(truth, hole)[0].astype(np.float32)
     detail = filled - cv2.GaussianBlur(filled, (0, 0), 1.0)
     inner = np.s_[64:96, 74:126]
     assert 0.6 < detail[inner].std() / detail[~hole].std() < 1.25

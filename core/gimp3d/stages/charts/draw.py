@@ -14,7 +14,7 @@ from ...box import Region, in_region
 from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
-from ...solvers.variogram import carried
+from ...solvers.kriging import carried
 from ..footprint import GRAIN, shows_object
 from ..masks import ViewMasks
 from ..mosaic import mosaic

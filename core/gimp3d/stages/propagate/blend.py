@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ...solvers.colours import biweight
 from ...solvers.poisson import solve_poisson
+from ...solvers.robust import biweight
 
 SEAM = 0.05  # relative depth step between neighbours that parts two surfaces: 2.5 times what depths scatter by
 LEAST_BAND = 20  # px of photo that tell the level of a part

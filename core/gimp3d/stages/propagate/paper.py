@@ -17,8 +17,8 @@ from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import parallel_map, run_ranges
 from ...geometry import SAME_DEPTH, colours_at
-from ...solvers.colours import exposure_gain
 from ...solvers.poisson import solve_poisson
+from ...solvers.robust import exposure_gain
 from .blend import SEAM, SQUARE, to_bytes
 from .types import Loader, PropagateSettings, Reference, Rule, ViewToPaint
 from .warp import Picture, Warp, picture_of, shown_at
