@@ -19,7 +19,7 @@ from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import surface_points
-from .outline import box_window
+from .look import box_window
 
 CELLS = 800_000  # of the grid round one box at most: more take seconds and hold too few points each
 VIEWS = 60  # at most so many, spread evenly, are gathered: further ones show the same surface
