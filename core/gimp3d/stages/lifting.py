@@ -156,9 +156,8 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
             r, c = rows[of], cols[of]
             out[r, c] = shadow.arriving(points[r, c], number)
 
-    h, w = depth.shape
-    some_rows, some_cols = np.unique([*range(0, h, STRIDE), h - 1]), np.unique([*range(0, w, STRIDE), w - 1])
-    grid = np.ix_(some_rows, some_cols)
+    some = [np.unique([*range(0, n, STRIDE), n - 1]) for n in depth.shape]
+    grid = np.ix_(*some)
     ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
     few = out[grid]
     if few.min() > UNTOUCHED:
@@ -166,11 +165,8 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     kernel, dim = np.ones((3, 3), np.uint8), _grey(few)
     steps, borders = (cv2.morphologyEx(a, cv2.MORPH_GRADIENT, kernel) for a in (dim, on[grid].astype(np.float32)))
     uneven = (steps > EVEN) | ((borders > 0) & (cv2.erode(dim, kernel) < UNTOUCHED))
-    y, x = (
-        np.interp(np.arange(n), some, np.arange(len(some))).astype(np.float32)
-        for n, some in ((h, some_rows), (w, some_cols))
-    )
-    x, y = np.meshgrid(x, y)
+    between = [np.interp(np.arange(n), s, np.arange(len(s))).astype(np.float32) for n, s in zip(depth.shape, some)]
+    y, x = np.meshgrid(*between, indexing="ij")
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
     lit = (on >= 0) & ~witness.hidden & (_grey(out) >= UNTOUCHED)

@@ -17,7 +17,7 @@ from ..gaussians import Gaussians
 from ..geometry import bounds, dilated, window_mask
 from ..progress import Progress, silent
 from ..raster import drawing, touched_window
-from .growth import NOTHING, Growth
+from .growth import Growth
 from .look import AROUND, ViewBefore, box_polygon, depth_agreement, fill_polygon, in_front, look, uncovered
 from .selection import Selection, SelectionSettings, by_centre, choose, select_removed
 
@@ -100,8 +100,10 @@ class Masks:
 
     @property
     def proposed(self) -> dict[str, Any]:
-        """What else of the object there is, see Growth.facts."""
-        return self.growth.facts if self.growth else NOTHING
+        """What of the object stays, as in a removal's summary: how many Gaussians, and a box that holds them too."""
+        if self.growth is None or self.growth.taken or self.growth.box is None:
+            return {"gaussians": 0, "box": None}
+        return {"gaussians": int(self.growth.rows.sum()), "box": self.growth.box.to_json()}
 
     def grown(self, region: Region) -> Region:
         """The boxes that hold what goes: larger ones if what they cut off goes too."""

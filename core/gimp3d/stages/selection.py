@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from ..box import Box, Region, in_region
-from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import dilated, surface_points
@@ -129,7 +128,8 @@ def choose(
         return centre, list(before), None  # pictures this small show no surface to follow
     reach = [replace(box, size=box.size + 2 * SLACK * cell) for box in region]
     shown = over(lambda b: shown_in(b, reach, surroundings), before)
-    members = [boxes_of(b.camera, np.where(s == Shows.OBJECT, b.depth, 0), reach) for b, s in zip(before, shown)]
+    object_points = [surface_points(b.camera, b.depth * (s == Shows.OBJECT))[2] for b, s in zip(before, shown)]
+    members = [np.stack([box.contains(points) for box in reach], axis=1) for points in object_points]
     stands = standing(members, [int(b.polygon.sum()) for b in before])
     objects = tuple(box for box, s in zip(region, stands) if s)
     named = tuple(box for box, s in zip(region, stands) if not s)
@@ -188,15 +188,9 @@ def shown_in(view: ViewBefore, region: Sequence[Box], surroundings: Sequence[Fol
     return shows
 
 
-def boxes_of(camera: Camera, depth: np.ndarray, region: Sequence[Box]) -> np.ndarray:
-    """[M, B] bool: the boxes in which each pixel of the object's own depth map [H, W] lies."""
-    _, _, points = surface_points(camera, depth)
-    return np.stack([box.contains(points) for box in region], axis=1)
-
-
 def standing(members: Sequence[np.ndarray], outlines: Sequence[int]) -> list[bool]:
-    """Which boxes something stands in: greedily those that hold most of it (`members` [M, B] bool of each view,
-    `boxes_of`), as long as they add enough in some view to the `outlines`, the region's pixels in each.
+    """Which boxes something stands in: greedily those that hold most of it, as long as they add enough in some view to
+    `outlines`, the region's pixels; `members` [M, B] bool of each view: in which boxes its pixels of the object lie.
 
     A box round a shadow also holds the object's foot; that is the object's box's already.
     """

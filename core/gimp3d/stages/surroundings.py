@@ -50,11 +50,8 @@ class FollowedSurface:
     points: np.ndarray  # [M, 3] on the surface
     normals: np.ndarray  # [M, 3] unit
 
-    def distance(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-    ) -> np.ndarray:
-        """[N]: how far points lie off the surface's plane nearby, in scene units; infinite where there is none."""
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """[N]: how far points [N, 3] of the scene lie off the surface's plane nearby; infinite where there is none."""
         with np.errstate(invalid="ignore"):
             local = (points - self.box.center) @ self.box.axes
             index = np.floor((local + self.half) / self.cell)
