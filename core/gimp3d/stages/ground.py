@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -32,10 +32,7 @@ WALL_INLIER = 0.03  # diagonals of the region from a plane within which a point 
 WALL_SHARE = 0.25  # share of the points above the known planes that a wall holds
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
 
-
-@dataclass(frozen=True)
-class Ground(Facing):
-    """What photos show of a surface round the object, coarsely."""
+Ground = Facing  # what photos show of a surface round the object, coarsely
 
 
 def look_at(
@@ -96,24 +93,22 @@ def _shrunk(view: ViewMasks, witness: Witness, place: np.ndarray, texel: float) 
     """The view at about a texel's resolution at a place; colours are those beside the object."""
     camera = view.camera
     z = float(camera.project(place[None])[1][0])
-    factor = int(0.5 * texel * camera.fx / z) if z > 0 else 1
-    factor = min(factor, camera.width // 2, camera.height // 2)
+    factor = min(int(0.5 * texel * camera.fx / z) if z > 0 else 1, camera.width // 2, camera.height // 2)
     if factor < 2:
         return view, witness
     h, w = camera.height // factor, camera.width // factor
-    sizes = {"width": w, "height": h, **{k: getattr(camera, k) / factor for k in ("fx", "fy", "cx", "cy")}}
-    small = replace(camera, **sizes)
+    lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
+    small = replace(camera, width=w, height=h, **lens)
     middle = slice(factor // 2, h * factor, factor), slice(factor // 2, w * factor, factor)
 
     def blocks(values: np.ndarray) -> np.ndarray:
         return values[: h * factor, : w * factor].reshape(h, factor, w, factor, *values.shape[2:])
 
-    hidden, beside = (np.ascontiguousarray(m[middle]) for m in (witness.hidden, witness.beside))
+    hidden, beside, depth = (np.ascontiguousarray(m[middle]) for m in (witness.hidden, witness.beside, witness.depth))
     shown = ~(witness.hidden | witness.beside)
     count = blocks(shown).sum((1, 3))
     total = blocks(np.where(shown[..., None], witness.photo, 0)).sum((1, 3), dtype=np.int32)
     mean = (total / np.maximum(count, 1)[..., None]).astype(np.uint8)
     photo = np.where(count[..., None] > 0, mean, witness.photo[middle])
-    depth = np.ascontiguousarray(witness.depth[middle])
     maps = {f.name: getattr(view, f.name)[middle] for f in fields(view) if f.name != "camera"}
     return replace(view, camera=small, **maps), Witness(small, photo, hidden, beside, depth)

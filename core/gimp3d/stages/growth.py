@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.ndimage
@@ -32,8 +31,6 @@ LEAST = 10  # Gaussians of a piece that is worth proposing
 LEAST_WEIGHT = 0.5  # blend weight, summed over pixels and views, up to which a Gaussian shows nothing: half a pixel
 LARGE = 0.25  # longest standard deviation of a large Gaussian, as a share of the shortest edge of the boxes
 
-NOTHING: dict[str, Any] = {"gaussians": 0, "box": None}  # proposed
-
 
 @dataclass(frozen=True)
 class Growth:
@@ -44,13 +41,6 @@ class Growth:
     box: Box | None  # that one; None if nothing was cut
     taken: bool = False  # they go, and `region` counts
     endless: bool = False  # a part of what the boxes cut goes on too far to be the object's rest
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """As in a removal's summary."""
-        if self.taken:
-            return NOTHING
-        return {"gaussians": int(self.rows.sum()), "box": self.box.to_json() if self.box else None}
 
     @property
     def words(self) -> str:
@@ -76,7 +66,7 @@ def find_growth(
 ) -> Growth:
     """Which kept Gaussians are the object's, though the boxes or the surface under it kept them."""
     none = Growth(np.zeros(len(gaussians), bool), region, None)
-    outer = tuple(_enlarged(box, REACH * box.size.max()) for box in region)
+    outer = tuple(replace(box, size=box.size + 2 * REACH * box.size.max()) for box in region)
     longest = gaussians.scales.max(1)
     small = longest < LARGE * min(box.size.min() for box in region)
     there = gaussians.usable & (shown > LEAST_WEIGHT) & in_region(outer, gaussians.means.astype(np.float64))
@@ -101,16 +91,13 @@ def find_growth(
     pairs = pairs[(np.abs(colours[pairs[:, 0]] - colours[pairs[:, 1]]) < COLOUR).all(1)]
     parts = components(pairs, len(rows))
     held, cut = np.bincount(parts[object_], minlength=len(rows)), np.bincount(parts[~object_], minlength=len(rows))
-    known = in_region([_enlarged(box, -spacing) for box in outer], points)
+    known = in_region([replace(box, size=np.maximum(box.size - 2 * spacing, 0)) for box in outer], points)
     endless = np.bincount(parts[~object_ & ~known], minlength=len(rows)) > 0
     ours = held >= np.maximum(1, SHARE * (held + cut))
-    grown = np.flatnonzero((ours & ~endless)[parts] & ~object_)
-    renumbered = np.full(len(rows), -1)
-    renumbered[grown] = np.arange(len(grown))
-    within = renumbered[pairs]
-    pieces = components(within[(within >= 0).all(1)], len(grown))
-    sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[grown], minlength=1)
-    grown = grown[((sizes >= LEAST) & (likes > sizes / 2))[pieces]]
+    rest = (ours & ~endless)[parts] & ~object_
+    pieces = components(pairs[rest[pairs].all(1)], len(rows))[rest]
+    sizes, likes = np.bincount(pieces, minlength=1), np.bincount(pieces, like[rest], minlength=1)
+    grown = np.flatnonzero(rest)[((sizes >= LEAST) & (likes > sizes / 2))[pieces]]
     outside = int((~in_region(region, points[grown])).sum())
     too_much = outside > object_.sum() + len(grown) - outside
     if not len(grown) or too_much:
@@ -140,11 +127,6 @@ def components(pairs: np.ndarray, count: int) -> np.ndarray:
     """[count]: the number of each node's connected component, of the graph with edges [E, 2]."""
     graph = scipy.sparse.coo_matrix((np.ones(len(pairs), bool), pairs.T), (count, count))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-
-
-def _enlarged(box: Box, by: float) -> Box:
-    """With every face moved outwards."""
-    return replace(box, size=np.maximum(box.size + 2 * by, 0))
 
 
 def _holding(box: Box, points: np.ndarray, margin: float) -> Box:

@@ -1,35 +1,41 @@
-"""Undoing a shadow: photos and Gaussians as they would look with the light that the object kept from them."""
+"""Undoing a shadow or a reflection: photos and Gaussians as they would look in the light without the object."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..gaussians import Gaussians
-from ..geometry import Window, dilated, window_round
+from ..gaussians import SH_C0, Gaussians
+from ..geometry import Window, dilated, directions, window_round
+from ..raster import PixelRegion, label_weights, pixel_region
+from ..sh import sh_basis
 from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
 from .charts.hits import Hits, first_hits, pictured
 from .ground import Ground
-from .recolour import recoloured
 from .reflection import VISIBLE, Reflection
+from .seed import missing_colours
 from .shadow import UNTOUCHED, Shadow
 from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
-BRIGHTER = (
-    8.0  # grey levels by which lifted ground may be brighter than lit ground is: else less light is missing there
-)
+BRIGHTER = 8.0  # grey levels by which lifted ground may be brighter than lit: else less light is missing there
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
 MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
+LOOKS = 12  # views by which colours are corrected
+CORRECTIONS, HOLD = 10, 0.03  # steps of least squares, and px of blend weight by which the old colours are held
+SHOWN = 0.5  # px of blend weight by which photos show a Gaussian
+
+Undone = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # of a view: see Lifted.photos, shaded, dark, light
 
 
 @dataclass(frozen=True)
@@ -46,19 +52,6 @@ class Lifted:
     confidence: float
     reason: str
 
-    def after(self, first: Lifted) -> Lifted:
-        """Both, one after the other; this one's scene is the first one's."""
-        rows = np.union1d(first.rows, self.rows)
-        sh = np.zeros((len(rows), *self.sh.shape[1:]), np.float32)
-        sh[np.searchsorted(rows, first.rows)] = first.sh
-        sh[np.searchsorted(rows, self.rows)] = self.sh
-        light = tuple(np.minimum(a, b) for a, b in zip(first.light, self.light))
-        shaded = tuple(a | b for a, b in zip(first.shaded, self.shaded))
-        confidence, words = min(first.confidence, self.confidence), f"{first.reason}; {self.reason}"
-        return replace(
-            self, before=first.before, light=light, shaded=shaded, rows=rows, sh=sh, confidence=confidence, reason=words
-        )
-
     def scene(self, scene: Gaussians) -> Gaussians:
         """The scene with the new colours."""
         sh = scene.sh.copy()
@@ -66,21 +59,43 @@ class Lifted:
         return replace(scene, sh=sh)
 
 
-def lift_shadow(
+def lift(
     scene: Gaussians,
     removed: np.ndarray,  # [N] bool, the object
-    shadow: Shadow,
     witnesses: Sequence[Witness],
+    reflection: Reflection | None,
+    shadow: Shadow | None,  # one of them at least
 ) -> Lifted:
-    """Divide linear light by the share of it that arrives, in photos and in the Gaussians that they show in shadow."""
-    arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
-    photos, shaded, dark, light = zip(*parallel_map(lambda p: _lifted(*p), list(zip(witnesses, arriving))))
-    clear = [s & ~d for s, d in zip(shaded, dark)]
-    rows, sh = recoloured(scene, removed, witnesses, photos, shaded, clear, 0)
-    share = np.mean([s.mean() for s in shaded])
-    words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians lie in its shadow"
-    before = tuple(w.photo for w in witnesses)
-    return Lifted(before, photos, light, shaded, dark, rows, sh, shadow.confidence, words)
+    """Subtract the reflection's light, then divide by the share of light that arrives: in photos, and in the Gaussians
+    that they show there.
+
+    Trained splats hold reflections in what lies below the surface, in how its colours change with the view, or both:
+    all of their SH are corrected.
+    """
+    steps: list[tuple[float, Callable[[Sequence[Witness]], list[Undone]], int, str]] = []
+    if reflection is not None:
+        bare = partial(bare_photos, reflection)
+        steps.append((reflection.confidence, bare, scene.sh_degree, "show its reflection"))
+    if shadow is not None:
+        steps.append((shadow.confidence, partial(lifted_photos, shadow), 0, "lie in its shadow"))
+    before, sh, rows, words = tuple(w.photo for w in witnesses), scene.sh.copy(), np.zeros(0, int), []
+    shaded = tuple(np.zeros_like(w.hidden) for w in witnesses)
+    light = tuple(np.full(s.shape, 255, np.uint8) for s in shaded)
+    for _, undone, degree, how in steps:
+        photos, changed, dark, left = zip(*undone(witnesses))
+        clear = [c & ~d for c, d in zip(changed, dark)]
+        new, colours = recoloured(replace(scene, sh=sh), removed, witnesses, photos, changed, clear, degree)
+        sh[new] = colours
+        rows, witnesses = np.union1d(rows, new), [replace(w, photo=p) for w, p in zip(witnesses, photos)]
+        light, shaded = tuple(map(np.minimum, light, left)), tuple(map(np.logical_or, shaded, changed))
+        words.append(f"{np.mean([c.mean() for c in changed]):.1%} of the views' pixels and {len(new)} Gaussians {how}")
+    confidence = min(step[0] for step in steps)
+    return Lifted(before, photos, light, shaded, dark, rows, sh[rows], confidence, "; ".join(words))
+
+
+def lifted_photos(shadow: Shadow, witnesses: Sequence[Witness]) -> list[Undone]:
+    """Of each view: the photo without the shadow."""
+    return parallel_map(lambda w: _lifted(w, light_in(shadow, w)), witnesses)
 
 
 @dataclass(frozen=True)
@@ -98,8 +113,8 @@ def _grey(light: np.ndarray) -> np.ndarray:
     return cv2.transform(light, np.full((1, 3), 1 / 3))
 
 
-def _lifted(witness: Witness, arriving: Arriving) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A photo without the shadow, what changed in it, what cannot be lifted, and the light of 255."""
+def _lifted(witness: Witness, arriving: Arriving) -> Undone:
+    """A photo without the shadow."""
     photo, light = witness.photo.copy(), np.full(witness.hidden.shape, 255, np.uint8)
     shaded, dark = np.zeros((2, *light.shape), bool)
     part, window = witness.cropped(arriving.window), arriving.window
@@ -141,23 +156,17 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
             r, c = rows[of], cols[of]
             out[r, c] = shadow.arriving(points[r, c], number)
 
-    h, w = depth.shape
-    some_rows, some_cols = np.unique([*range(0, h, STRIDE), h - 1]), np.unique([*range(0, w, STRIDE), w - 1])
-    grid = np.ix_(some_rows, some_cols)
+    some = [np.unique([*range(0, n, STRIDE), n - 1]) for n in depth.shape]
+    grid = np.ix_(*some)
     ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
     few = out[grid]
     if few.min() > UNTOUCHED:
         return Arriving(window, np.ones_like(out), on >= 0, 255.0)
-    kernel = np.ones((3, 3), np.uint8)
-    dim = _grey(few)
-    uneven = cv2.dilate(dim, kernel) - cv2.erode(dim, kernel) > EVEN
-    numbers = on[grid].astype(np.float32)
-    uneven |= (cv2.dilate(numbers, kernel) != cv2.erode(numbers, kernel)) & (cv2.erode(dim, kernel) < UNTOUCHED)
-    y, x = (
-        np.interp(np.arange(n), some, np.arange(len(some))).astype(np.float32)
-        for n, some in ((h, some_rows), (w, some_cols))
-    )
-    x, y = np.meshgrid(x, y)
+    kernel, dim = np.ones((3, 3), np.uint8), _grey(few)
+    steps, borders = (cv2.morphologyEx(a, cv2.MORPH_GRADIENT, kernel) for a in (dim, on[grid].astype(np.float32)))
+    uneven = (steps > EVEN) | ((borders > 0) & (cv2.erode(dim, kernel) < UNTOUCHED))
+    between = [np.interp(np.arange(n), s, np.arange(len(s))).astype(np.float32) for n, s in zip(depth.shape, some)]
+    y, x = np.meshgrid(*between, indexing="ij")
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
     lit = (on >= 0) & ~witness.hidden & (_grey(out) >= UNTOUCHED)
@@ -183,41 +192,72 @@ def _mixed(witness: Witness) -> np.ndarray:
     return dilated(witness.hidden | witness.beside, 2)
 
 
-def bare_photos(
-    reflection: Reflection, witnesses: Sequence[Witness]
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each view: the photo without the mirror image's light, what changed in it, and of 255 how little."""
+def bare_photos(reflection: Reflection, witnesses: Sequence[Witness]) -> list[Undone]:
+    """Of each view: the photo without the mirror image's light."""
 
-    def of(witness: Witness) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def of(witness: Witness) -> Undone:
         added = reflection.added(witness.camera)
         changed = (np.abs(added).max(-1) > VISIBLE) & ~witness.hidden
         hits = first_hits(reflection.grounds, witness.camera, changed)
-        before = hits.behind(witness.depth, TOLERANCE)
-        changed &= (hits.chart == 0) & ~before
+        changed &= (hits.chart == 0) & ~hits.behind(witness.depth, TOLERANCE)
         photo, light = witness.photo.copy(), np.full(changed.shape, 255, np.uint8)
         bare = linear(photo[changed]) - added[changed]
         photo[changed] = np.clip(np.rint(encoded(np.maximum(bare, 0)) * 255), 0, 255)
         light[changed] = np.clip(255 - 255 * np.abs(added[changed]).max(-1), 0, 255)
-        return photo, changed, light
+        return photo, changed, np.zeros_like(changed), light
 
     return parallel_map(of, witnesses)
 
 
-def subtract_reflection(
+def recoloured(
     scene: Gaussians,
-    removed: np.ndarray,  # [N] bool, the object
-    reflection: Reflection,
+    removed: np.ndarray,  # [N] bool
     witnesses: Sequence[Witness],
-) -> Lifted:
-    """Take the mirror image's light out of photos and out of the Gaussians that they show there.
+    photos: Sequence[np.ndarray],  # as they would be
+    changed: Sequence[np.ndarray],  # [H, W] bool, where they are not as they were
+    clear: Sequence[np.ndarray],  # [H, W] bool, … and can be believed, but beside the object
+    degree: int,  # of the SH that are corrected
+    may: np.ndarray | None = None,  # [N] bool, rows that may change; None: all
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [M] of what shows in changed pixels, and colours [M, K, 3] by which the scene, drawn, shows the new photos.
 
-    Trained splats hold reflections in what lies below the surface, in how its colours change with the view, or both:
-    all of their SH are corrected.
+    Least squares (SIRT) over the views that show most of the change; held where photos stay as they are.
     """
-    photos, changed, light = zip(*bare_photos(reflection, witnesses))
-    rows, sh = recoloured(scene, removed, witnesses, photos, changed, changed, scene.sh_degree)
-    dark = tuple(np.zeros_like(c) for c in changed)
-    before = tuple(w.photo for w in witnesses)
-    share = np.mean([c.mean() for c in changed])
-    words = f"{share:.1%} of the views' pixels and {len(rows)} Gaussians show its reflection"
-    return Lifted(before, photos, light, changed, dark, rows, sh, reflection.confidence, words)
+    stays = np.flatnonzero(~removed)
+    kept = scene.take(stays)
+    looks = sorted(range(len(changed)), key=lambda k: -int(changed[k].sum()))[:LOOKS]
+    looks = [k for k in looks if changed[k].any()]
+
+    def shown(k: int) -> np.ndarray:
+        labels = np.where(witnesses[k].hidden, 0, 1 + changed[k]).astype(np.uint8)
+        return label_weights(kept, witnesses[k].camera, labels, 2)
+
+    weights = np.array(parallel_map(shown, looks)).reshape(-1, 2, len(kept))
+    rows = np.flatnonzero((weights[:, 1].sum(0) > SHOWN) & (may is None or may[stays]))
+    if not len(rows):
+        return stays[rows], scene.sh[stays[rows]]
+    others = np.ones(len(kept), bool)
+    others[rows] = False
+    rest, lit, bands = kept.take(others), kept.take(rows), (degree + 1) ** 2
+
+    def prepared(k: int) -> tuple[PixelRegion, np.ndarray, np.ndarray]:
+        mask = clear[k] & ~witnesses[k].beside
+        return pixel_region(rest, witnesses[k].camera, mask, passes=frozenset({"rgb"})), mask, photos[k]
+
+    ready, means = parallel_map(prepared, looks), lit.means.astype(np.float64)
+    bases = [sh_basis(directions(means, witnesses[k].camera), degree) / SH_C0 for k in looks]
+    change, now = np.zeros((len(rows), bands, 3)), lit
+    for _ in range(CORRECTIONS):
+        bends = np.tile(HOLD * np.eye(bands), (len(rows), 3, 1, 1))  # a channel that is clamped at 0 has no weight
+        slopes = np.zeros((len(rows), 3, bands))
+        asked = [(region, now, mask, photo) for region, mask, photo in ready]
+        steps = parallel_map(lambda a: missing_colours(*a), asked)
+        for (weight, missing), basis, steady in zip(steps, bases, weights[:, 0, rows]):
+            bends += (weight + steady[:, None])[..., None, None] * (basis[:, :, None] * basis[:, None])[:, None]
+            here = missing + weight * np.einsum("mk,mkc->mc", basis, change)
+            slopes += here[..., None] * basis[:, None]
+        change = np.linalg.solve(bends, slopes[..., None])[..., 0].transpose(0, 2, 1)
+        sh = lit.sh.copy()
+        sh[:, :bands] += change
+        now = replace(lit, sh=sh)
+    return stays[rows], now.sh

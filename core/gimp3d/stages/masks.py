@@ -1,7 +1,4 @@
-"""The stage that finds what goes, and what each view shows then (paper 3.2, docs/method.md).
-
-`look` shows each view with and without the object, `selection` decides which Gaussians go.
-"""
+"""The stage that finds what goes, and what each view shows then (paper 3.2, docs/method.md)."""
 
 from __future__ import annotations
 
@@ -12,18 +9,17 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from ..box import Region
+from ..box import Region, in_region
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput, IllPosed
 from ..gaussians import Gaussians
-from ..geometry import bounds, dilated
+from ..geometry import bounds, dilated, window_mask
 from ..progress import Progress, silent
-from .growth import NOTHING, Growth
-from .look import MOSTLY_OBJECT, ViewAfter, ViewBefore, look, look_without, outlines
+from ..raster import drawing, touched_window
+from .growth import Growth
+from .look import AROUND, ViewBefore, box_polygon, depth_agreement, fill_polygon, in_front, look, uncovered
 from .selection import Selection, SelectionSettings, by_centre, choose, select_removed
-from .targets import CHANGED, in_front, uncovered
-from .visibility import depth_agreement
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -32,6 +28,8 @@ R = TypeVar("R")
 USUAL_AGREEMENT = 0.97
 LEAST_AGREEMENT = 0.5  # share of surface that two views must place alike, else the mode is "paper": the majority
 LEAST_LIKENESS = 0.5  # correlation of photos with what the scene shows, else the mode is "paper"
+CHANGED = 0.02  # blend weight of removed Gaussians above which the object touched a pixel: five grey levels of 255
+MOSTLY_OBJECT = 0.5  # blend weight of removed Gaussians above which a pixel shows the object and not what surrounds it
 
 
 @dataclass(frozen=True)
@@ -102,8 +100,10 @@ class Masks:
 
     @property
     def proposed(self) -> dict[str, Any]:
-        """What else of the object there is, see Growth.facts."""
-        return self.growth.facts if self.growth else NOTHING
+        """What of the object stays, as in a removal's summary: how many Gaussians, and a box that holds them too."""
+        if self.growth is None or self.growth.taken or self.growth.box is None:
+            return {"gaussians": 0, "box": None}
+        return {"gaussians": int(self.growth.rows.sum()), "box": self.growth.box.to_json()}
 
     def grown(self, region: Region) -> Region:
         """The boxes that hold what goes: larger ones if what they cut off goes too."""
@@ -151,23 +151,20 @@ def find_masks(
         return look(gaussians, camera, polygons, photos.get(camera.id), extra.get(camera.id), not rule.by_centre)
 
     before = over(looked, outlined)
-    agreement = depth_agreement([b.camera for b in before], [b.depth for b in before], [b.window for b in before])
+    agreement = depth_agreement(before)
     selection, growth = by_centre(inside), None
     if not rule.by_centre:
         # Where views disagree on what they see, trainers have left that much more smears behind the object.
         support = rule.support and rule.support + max(0.0, USUAL_AGREEMENT - agreement)
         selection, before, growth = choose(gaussians, region, before, support, settings.grow, over)
     gone = gaussians.take(selection.removed)
-    after = over(lambda b: look_without(gaussians, gone, selection.removed, b), before)
-    mode, warnings = settings.mode, _inconsistencies(before, agreement) if settings.mode == "need" else ()
-    if warnings:
-        mode = "paper"
+    warnings = _inconsistencies(before, agreement) if settings.mode == "need" else ()
+    mode = "paper" if warnings else settings.mode
 
-    def masked(both: tuple[ViewBefore, ViewAfter]) -> ViewMasks:
-        hole = uncovered(gaussians, selection.removed, both[0]) if mode == "paper" else None
-        return _view_masks(*both, hole, not warnings)
+    def masked(view: ViewBefore) -> ViewMasks:
+        return _view_masks(gaussians, gone, selection.removed, view, mode, not warnings)
 
-    views = tuple(parallel_map(masked, list(zip(before, after))))
+    views = tuple(over(masked, before))
     reason = f"{selection.words}; {len(views)} views see the region"
     told = [growth.words] if growth and growth.words else []
     if settings.grow and growth is None:
@@ -186,9 +183,10 @@ def find_masks(
 
 
 def _outlined(region: Region, cameras: Sequence[Camera]) -> list[tuple[Camera, list[np.ndarray]]]:
-    """The cameras that see the region from outside, each with the boxes' outlines."""
-    usable = [c for c in cameras if not any(b.contains(c.centre[None])[0] for b in region)]
-    found = [(c, polygons) for c in usable if (polygons := outlines(region, c))]
+    """The cameras that see the region from outside, each with the boxes' outlines [M, 2] in pixels."""
+    usable = [c for c in cameras if not in_region(region, c.centre[None])[0]]
+    outlines = [(c, [p for box in region if (p := box_polygon(box, c)) is not None]) for c in usable]
+    found = [(c, polygons) for c, polygons in outlines if any(fill_polygon(p, c).any() for p in polygons)]
     if not found:
         within = len(cameras) - len(usable)
         raise IllPosed(
@@ -227,19 +225,29 @@ def _inconsistencies(before: Sequence[ViewBefore], agreement: float) -> tuple[st
     return tuple(found)
 
 
-def _view_masks(before: ViewBefore, after: ViewAfter, needed: np.ndarray | None, consistent: bool) -> ViewMasks:
-    window, depth = after.window, before.depth
-    silhouette, occluder, beside = np.zeros((3, *depth.shape), bool)
-    silhouette[window] = after.weight > CHANGED
-    if consistent:  # else depths say nothing
-        occluder[window] = in_front(depth[window], after.weight > MOSTLY_OBJECT)
+def _view_masks(
+    gaussians: Gaussians,
+    gone: Gaussians,  # the object, of the rows …
+    removed: np.ndarray,  # … [N] bool
+    before: ViewBefore,
+    mode: str,
+    consistent: bool,  # what depths say of other views
+) -> ViewMasks:
+    """A view's masks; without the object only the part that it touched is drawn anew."""
+    camera, depth = before.camera, before.depth
+    window = touched_window(gone, camera, AROUND)
+    scene = drawing(gaussians, camera, with_colour=False, pixels=window_mask(window, camera))
+    shown_after = before.depth.copy(), before.alpha.copy()
+    for whole, part in zip(shown_after, scene.surface_depth(gone=removed)):
+        whole[window] = part[window]
+    weight = scene.footprint(removed)[window]
+    silhouette, occluder, beside, target = np.zeros((4, *depth.shape), bool)
+    silhouette[window] = weight > CHANGED
+    if consistent:
+        occluder[window] = in_front(depth[window], weight > MOSTLY_OBJECT)
     beside[window] = dilated(occluder[window], 2)
-    target = np.zeros(depth.shape, bool)
-    if needed is not None:  # beside what is in front T must not outgrow the object
-        target = needed & ~occluder & (silhouette | ~beside)
+    if mode == "paper":  # beside what is in front T must not outgrow the object
+        target = uncovered(gaussians, removed, before) & ~occluder & (silhouette | ~beside)
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
-    depth_after, alpha_after = before.depth.copy(), before.alpha.copy()
-    depth_after[window], alpha_after[window] = after.depth, after.alpha
-    shown = depth, before.alpha, depth_after, alpha_after
-    return ViewMasks(before.camera, before.polygon, silhouette, occluder, target, *shown)
+    return ViewMasks(camera, before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after)

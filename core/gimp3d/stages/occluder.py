@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.stats import norm, qmc
@@ -59,21 +58,20 @@ class Occluder:
         g = standing(gaussians, plane, diagonal)
         if len(g) < SAMPLES:
             return None
-        scales = -np.sort(-g.scales, axis=1).astype(np.float64)
         means = plane.local(g.means.astype(np.float64))
-        own = g.scales.astype(np.float64)
-        own = np.concatenate([own, np.zeros((len(g), 3 - own.shape[1]))], axis=1)
-        axes = plane.axes @ quats_to_matrices(g.quats.astype(np.float64)) * own[:, None]
+        scales = np.pad(g.scales.astype(np.float64), ((0, 0), (0, 3 - g.scales.shape[1])))
+        axes = plane.axes @ quats_to_matrices(g.quats.astype(np.float64)) * scales[:, None]
         normal = norm.ppf((qmc.Sobol(3, scramble=False).random(SAMPLES) + 0.5 / SAMPLES) % 1)
         points = means[:, None] + np.einsum("nij,sj->nsi", axes, normal)
-        low, high = np.percentile(means, 0.5, axis=0), np.percentile(means, 99.5, axis=0)
+        low, high = np.percentile(means, (0.5, 99.5), axis=0)
         low, high = low - 0.02 * diagonal, high + 0.02 * diagonal
         low[2] = 0.0 if low[2] < STANDS * diagonal else low[2]
         cell = float((high - low).max()) / CELLS
         shape = np.maximum(1, np.ceil((high - low) / cell)).astype(int)
         index = np.floor((points - low) / cell).astype(int)
         inside = ((index >= 0) & (index < shape)).all(-1)
-        area = 2 * np.pi * scales[:, 0] * scales[:, 1] * g.opacity / SAMPLES
+        _, second, first = np.sort(scales, axis=1).T
+        area = 2 * np.pi * first * second * g.opacity / SAMPLES
         weights = np.broadcast_to(area[:, None], inside.shape)[inside]
         cells = np.bincount(np.ravel_multi_index(tuple(index[inside].T), tuple(shape)), weights, int(shape.prod()))
         thickness = (cells / cell**2).reshape(shape).astype(np.float32)
@@ -84,7 +82,7 @@ class Occluder:
         walls = [o.normal for o in others if o.crosses(plane) and o.local(centre)[0, 2] > 0]
         return cls(plane, low, cell, thickness, np.reshape(walls, (-1, 3)) @ plane.axes.T)
 
-    @cached_property
+    @property
     def size(self) -> np.ndarray:
         """[3] sides of the volume."""
         return np.array(self.thickness.shape) * self.cell
@@ -98,12 +96,10 @@ class Occluder:
         """The same object elsewhere on the plane."""
         return replace(self, low=self.low + np.array([x, y, 0.0]))
 
-    def blocked(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-        directions: np.ndarray,  # [D, 3] unit, in the plane's axes, towards the light
-    ) -> np.ndarray:
-        """[N, D] float32: the share of light from far away that does not arrive (Beer and Lambert)."""
+    def blocked(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """[N, D] float32: the share of light from far away that does not arrive at points [N, 3] of the scene (Beer and
+        Lambert); directions [D, 3] are unit vectors towards the light, in the plane's axes.
+        """
         out = np.zeros((len(points), len(directions)), np.float32)
         start = (self.plane.local(points) - self.low) / self.cell
         run_ranges(_march_range, len(points), start, np.ascontiguousarray(directions), self.thickness, STEP, out)

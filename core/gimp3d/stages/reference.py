@@ -17,6 +17,7 @@ from .masks import ViewMasks
 
 SAMPLES = 2000  # of the hidden surface from each view, about
 SURFACE_VIEWS = 12  # views, evenly chosen, that say where the hidden surface may be: each costs a completion
+NO_SURFACE = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))  # points, normals, spacing
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class ViewScore:
     """What a view would explain of the hidden surface; shares of its area, 0 to 1."""
 
     camera_id: str
-    score: float  # Σ over the surface of visible × cos θ × pixels per area, each relative to the best view of it
+    score: float  # Σ over the surface of visible × cos θ × pixels per area, relative to the best view of each place
     covered: float  # share of the surface that the view shows
     facing: float  # mean cos θ where it does
     detail: float  # mean pixels per area there, relative to the view that shows most
@@ -54,7 +55,7 @@ def needed_surface(views: Sequence[ViewMasks], samples: int = SAMPLES) -> tuple[
     seeing = [v for v in views if v.target.any()]
     step = max(1, -(-len(seeing) // SURFACE_VIEWS))
     parts = parallel_map(lambda v: _surface_in(v, samples), seeing[::step], most=2)  # mostly Python's work
-    points, normals, sizes = (np.concatenate([p[k] for p in parts] or [np.zeros((0, 3))]) for k in range(3))
+    points, normals, sizes = map(np.concatenate, zip(*(parts or [NO_SURFACE])))
     if not len(points):
         return points, normals
     cell = float(np.median(sizes))
@@ -70,7 +71,7 @@ def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
     try:
         completed = complete_depth(disparity_of(depth), rim(view)[part], target)
     except IllPosed:
-        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 1))
+        return NO_SURFACE
     depth = np.where(target, completed.depth, depth)
     normals = surface_normals(camera, depth)
     rows, cols = np.nonzero(target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
@@ -99,10 +100,7 @@ def choose_reference(
     wanted: str | None = None,
     tried: Collection[str] = (),  # views completed before: what is open in them still, they do not reach
 ) -> ReferenceChoice:
-    """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame.
-
-    Score: Σ over the needed surface of visible × cos θ × pixels per area, each sample relative to
-    the best view of it: 1 is a view that shows everything as well as any does.
+    """The view that shows most of the hidden surface, square on, in detail, and not cut off by the frame (ViewScore).
 
     Raises
     ------
@@ -125,9 +123,9 @@ def choose_reference(
         return ViewScore(view.camera.id, worth.sum() / len(shown), shown.mean(), float(cosine[shown].mean()), detail)
 
     scores = sorted((score(*c) for c in candidates), key=lambda s: (-s.score, s.camera_id))
-    if wanted is not None and wanted not in {s.camera_id for s in scores}:
+    chosen = next((s for s in scores if wanted in (None, s.camera_id)), None)
+    if chosen is None:
         raise IllPosed(f"reference {wanted} does not see the hole; leave --reference out and one is chosen")
-    chosen = next(s for s in scores if wanted in (None, s.camera_id))
     how = "as asked" if wanted else "explains most of the hidden surface"
     reason = (
         f"{chosen.camera_id}: {how}: shows {chosen.covered:.0%} of it, facing it by cos {chosen.facing:.2f}, with "

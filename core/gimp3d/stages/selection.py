@@ -10,16 +10,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..box import Region, in_region
-from ..camera import Camera
+from ..box import Box, Region, in_region
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import dilated, surface_points
 from ..raster import label_weights
 from ..schema import Share
 from .growth import LEAST_WEIGHT, Growth, find_growth
-from .look import ViewBefore
-from .outline import box_window
+from .look import ViewBefore, box_window
 from .surroundings import THICKNESS, FollowedSurface, follow_surface
 from .witness import total_over
 
@@ -95,26 +93,7 @@ class Shows(IntEnum):
     MASKED = 3  # under the user's extra mask
 
 
-@dataclass(frozen=True)
-class Sighting:
-    """What a view shows."""
-
-    camera: Camera
-    shows: np.ndarray  # [H, W] uint8, see Shows
-    masked: bool  # it has an extra mask
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Each Gaussian's blend weight summed over pixels and views, with the object in place; all [N].
-
-    `object_` and `clear` are whole near the boxes only, see `near_region`.
-    """
-
-    object_: np.ndarray
-    clear: np.ndarray
-    masked: np.ndarray  # under extra masks …
-    unmasked: np.ndarray  # … and beside them, in the views that have one
+Sightings = Sequence[tuple[ViewBefore, np.ndarray]]  # views and what their pixels show, [H, W] uint8, see Shows
 
 
 def select_removed(gaussians: Gaussians, region: Region) -> np.ndarray:
@@ -135,7 +114,7 @@ def choose(
     before: Sequence[ViewBefore],
     support: float,  # see SelectionSettings
     grow: bool,  # what of the object the boxes cut off goes too
-    over: Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]] = parallel_map,
+    over: Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]],  # parallel_map, or one that tells how far it is
 ) -> tuple[Selection, list[ViewBefore], Growth | None]:
     """Which Gaussians go, by what views show of them; the views, what else the user named masked out; what was cut off.
 
@@ -144,79 +123,74 @@ def choose(
     depths = [(b.camera, b.depth) for b in before]
     surroundings = [follow_surface(box, region, depths) for box in region]
     centre = by_centre(select_removed(gaussians, region))
+    cell = max(part.cell for part in surroundings)
     if all(box.size.max() < LEAST_CELLS * s.cell for box, s in zip(region, surroundings)):
         return centre, list(before), None  # pictures this small show no surface to follow
-    seen = over(lambda b: object_and_rim(b.camera, b.depth, region, surroundings), before)
-    members = [boxes_of(b.camera, np.where(o, b.depth, 0), region, surroundings) for b, (o, _) in zip(before, seen)]
+    reach = [replace(box, size=box.size + 2 * SLACK * cell) for box in region]
+    shown = over(lambda b: shown_in(b, reach, surroundings), before)
+    object_points = [surface_points(b.camera, b.depth * (s == Shows.OBJECT))[2] for b, s in zip(before, shown)]
+    members = [np.stack([box.contains(points) for box in reach], axis=1) for points in object_points]
     stands = standing(members, [int(b.polygon.sum()) for b in before])
     objects = tuple(box for box, s in zip(region, stands) if s)
     named = tuple(box for box, s in zip(region, stands) if not s)
 
     def with_named(view: ViewBefore) -> ViewBefore:
-        mask = surface_in(view.camera, view.depth, named) & ~surface_in(view.camera, view.depth, objects)
+        mask = surface_in(view, named) & ~surface_in(view, objects)
         return replace(view, extra=mask if view.extra is None else mask | view.extra)
 
     views = parallel_map(with_named, before) if named else list(before)
     if not objects:
         return centre, views, None
-    sightings = parallel_map(lambda pair: _sighting(pair[0], *pair[1]), list(zip(views, seen)))
-    near = near_region(gaussians, objects)
-    weights = weigh(gaussians, near, sightings)
-    selection = select(gaussians, objects, weights, [s for s, o in zip(surroundings, stands) if o])
+    sightings = list(zip(views, shown))
+    for view, shows in sightings:
+        if view.extra is not None:
+            shows[view.extra] = Shows.MASKED
+    reaches, surrounds = _near(gaussians, objects, NEAR)
+    weights = weigh(gaussians, reaches | surrounds, sightings)
+    selection = select(gaussians, objects, reaches, weights, [s for s, o in zip(surroundings, stands) if o])
+    object_, clear, *_ = weights
     if support > 0:
-        revealed = weigh_revealed(gaussians, selection, near, sightings)
-        selection = without_revealed(gaussians, selection, objects, weights.clear, revealed, support)
+        selection = without_revealed(gaussians, selection, surrounds, clear, sightings, support)
     of_object = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
-    growth = find_growth(gaussians, objects, of_object, ~selection.removed, weights.object_ + weights.clear, depths)
+    growth = find_growth(gaussians, objects, of_object, ~selection.removed, object_ + clear, depths)
     fates = np.where(growth.rows & grow, np.uint8(Fate.REMOVED_GROWN), selection.fates)
     alone = select_removed(gaussians, named) & ~in_region(objects, gaussians.means.astype(np.float64))
     growth = replace(growth, region=growth.region + named, taken=grow and growth.box is not None)
     return Selection(np.where(alone, np.uint8(Fate.REMOVED_INSIDE), fates)), views, growth
 
 
-def _sighting(view: ViewBefore, object_: np.ndarray, ring: np.ndarray) -> Sighting:
-    shows = np.full(object_.shape, Shows.CLEAR, np.uint8)
-    shows[ring | view.misfit] = Shows.NOTHING
-    shows[object_] = Shows.OBJECT
-    if view.extra is not None:
-        shows[view.extra] = Shows.MASKED
-    return Sighting(view.camera, shows, view.extra is not None)
-
-
-def object_and_rim(
-    camera: Camera, depth: np.ndarray, region: Region, surroundings: Sequence[FollowedSurface]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of a depth map with the object [H, W], 0 = nothing, whose first surface lies in the region and is not the
-    surroundings', and the ring round them.
-
-    Both [H, W] bool. In the ring the colours of splats that stand where the object meets the floor run together.
-    """
-    found = np.zeros(depth.shape, np.uint8)
-    cell = max(part.cell for part in surroundings)
+def surface_in(view: ViewBefore, region: Sequence[Box], surroundings: Sequence[FollowedSurface] = ()) -> np.ndarray:
+    """[H, W] bool: pixels whose first surface lies in the region and is not the surroundings'."""
+    found = np.zeros(view.depth.shape, bool)
     for box in region:
-        grown = replace(box, size=box.size + 2 * SLACK * cell)
-        rows, cols, points = surface_points(camera, depth, box_window(grown, camera))
-        inside = np.flatnonzero(grown.contains(points))
+        rows, cols, points = surface_points(view.camera, view.depth, box_window(box, view.camera))
+        inside = np.flatnonzero(box.contains(points))
         for part in surroundings:
             inside = inside[part.distance(points[inside]) > THICKNESS * part.cell]
-        found[rows[inside], cols[inside]] = 1
+        found[rows[inside], cols[inside]] = True
+    return found
+
+
+def shown_in(view: ViewBefore, region: Sequence[Box], surroundings: Sequence[FollowedSurface]) -> np.ndarray:
+    """[H, W] uint8, see Shows: what a view shows, but for its extra mask; the object stands in the region.
+
+    In a ring round it the colours of splats that stand where it meets the floor run together.
+    """
+    shows = np.full(view.depth.shape, Shows.CLEAR, np.uint8)
+    found = surface_in(view, region, surroundings).astype(np.uint8)
     object_ = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-    if not object_.any():
-        return object_, object_
-    width = max(1, round(camera.fx * RIM * cell / float(np.median(depth[object_]))))
-    return object_, dilated(object_, width) & ~object_
-
-
-def boxes_of(camera: Camera, depth: np.ndarray, region: Region, surroundings: Sequence[FollowedSurface]) -> np.ndarray:
-    """[M, B] bool: the boxes in which each pixel of the object's own depth map [H, W] lies, or just outside."""
-    _, _, points = surface_points(camera, depth)
-    slack = 2 * SLACK * max(part.cell for part in surroundings)
-    return np.stack([replace(b, size=b.size + slack).contains(points) for b in region], axis=1)
+    if object_.any():
+        rim = RIM * max(part.cell for part in surroundings) / float(np.median(view.depth[object_]))
+        shows[dilated(object_, max(1, round(view.camera.fx * rim)))] = Shows.NOTHING
+    if view.agrees is not None:
+        shows[view.window][~view.agrees] = Shows.NOTHING
+    shows[object_] = Shows.OBJECT
+    return shows
 
 
 def standing(members: Sequence[np.ndarray], outlines: Sequence[int]) -> list[bool]:
-    """Which boxes something stands in: greedily those that hold most of it (`members` [M, B] bool of each view,
-    `boxes_of`), as long as they add enough in some view to the `outlines`, the region's pixels in each.
+    """Which boxes something stands in: greedily those that hold most of it, as long as they add enough in some view to
+    `outlines`, the region's pixels; `members` [M, B] bool of each view: in which boxes its pixels of the object lie.
 
     A box round a shadow also holds the object's foot; that is the object's box's already.
     """
@@ -232,35 +206,28 @@ def standing(members: Sequence[np.ndarray], outlines: Sequence[int]) -> list[boo
         left = [m[~m[:, best]] for m in left]
 
 
-def surface_in(camera: Camera, depth: np.ndarray, region: Region) -> np.ndarray:
-    """[H, W] bool: pixels whose first surface (z in `depth` [H, W], 0 = nothing) lies in the region."""
-    found = np.zeros(depth.shape, bool)
-    for box in region:
-        rows, cols, points = surface_points(camera, depth, box_window(box, camera))
-        found[rows, cols] |= box.contains(points)
-    return found
+def weigh(gaussians: Gaussians, near: np.ndarray, sightings: Sightings) -> np.ndarray:
+    """[4, N]: each Gaussian's blend weight summed over pixels and views, with the object in place: on the object, on
+    what is clear of it – both whole for the rows `near` [N] bool only –, and, in the views that have an extra mask,
+    under it and beside it.
+    """
 
+    def of(sighting: tuple[ViewBefore, np.ndarray]) -> np.ndarray:
+        view, shows = sighting
+        rows = near if view.extra is None else None
+        object_, clear, masked = label_weights(gaussians, view.camera, shows, Shows.MASKED, rows)
+        unmasked = np.zeros_like(clear) if view.extra is None else object_ + clear
+        return np.stack([object_, clear, masked, unmasked])
 
-def near_region(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.ndarray:
-    """[N] bool: rows of whose fate something but extra masks can decide."""
-    return _reaches(gaussians, region) | _surrounds(gaussians, region, near)
-
-
-def weigh(gaussians: Gaussians, near: np.ndarray, sightings: Sequence[Sighting]) -> Weights:
-    """Where each Gaussian shows while the object is there: one pass per view. `near` [N] bool as by `near_region`."""
-    empty = np.zeros((2, len(gaussians)))
-
-    def of(view: Sighting) -> np.ndarray:
-        rows = np.ones(len(gaussians), bool) if view.masked else near
-        last = Shows.MASKED if view.masked else Shows.CLEAR
-        object_, clear, *masked = label_weights(gaussians, view.camera, view.shows, last, rows)
-        return np.stack([object_, clear, masked[0], object_ + clear] if masked else [object_, clear, *empty])
-
-    return Weights(*total_over(sightings, of, (4, len(gaussians))))
+    return total_over(sightings, of, (4, len(gaussians)))
 
 
 def select(
-    gaussians: Gaussians, region: Region, weights: Weights, surroundings: Sequence[FollowedSurface]
+    gaussians: Gaussians,
+    region: Region,
+    reaches: np.ndarray,  # [N] bool, see _near
+    weights: np.ndarray,  # [4, N], see weigh
+    surroundings: Sequence[FollowedSurface],
 ) -> Selection:
     """Every Gaussian's fate from where it lies and where it shows.
 
@@ -268,12 +235,12 @@ def select(
     background. What else reaches in goes if it shows mostly on the object: neither a halo is left nor a black hole
     opened.
     """
-    shown = weights.object_ + weights.clear
-    on_object = weights.object_ > MOSTLY * shown
-    visible = shown > LEAST_WEIGHT
+    object_, clear, masked, unmasked = weights
+    on_object = object_ > MOSTLY * (object_ + clear)
+    visible = object_ + clear > LEAST_WEIGHT
     centre, usable = select_removed(gaussians, region), gaussians.usable
     fates = np.zeros(len(gaussians), np.uint8)
-    astride = _reaches(gaussians, region) & usable & ~centre
+    astride = reaches & usable & ~centre
     fates[astride] = np.where((visible & on_object)[astride], Fate.REMOVED_STRADDLING, Fate.KEPT_STRADDLING)
     fates[centre] = Fate.REMOVED_INSIDE
     elsewhere = np.flatnonzero(centre & visible & ~on_object)
@@ -281,59 +248,49 @@ def select(
     for part in surroundings:
         stays |= np.isfinite(part.distance(gaussians.means[elsewhere].astype(np.float64)))
     fates[elsewhere[stays]] = Fate.KEPT_SURFACE
-    under_masks = weights.masked > np.maximum(LEAST_WEIGHT, MOSTLY * (weights.masked + weights.unmasked))
+    under_masks = masked > np.maximum(LEAST_WEIGHT, MOSTLY * (masked + unmasked))
     fates[under_masks & usable & (fates < Fate.REMOVED_INSIDE)] = Fate.REMOVED_MASKED
     return Selection(fates)
 
 
-def weigh_revealed(
-    gaussians: Gaussians, selection: Selection, near: np.ndarray, sightings: Sequence[Sighting]
-) -> np.ndarray:
-    """[N]: blend weight of the kept Gaussians where the object was, without it, summed over pixels and views.
-
-    Whole near the boxes only.
-    """
-    stays = ~selection.removed
-    kept, wanted = gaussians.take(stays), near[stays]
-
-    def of(view: Sighting) -> np.ndarray:
-        return label_weights(kept, view.camera, view.shows == Shows.OBJECT, 1, wanted)[0]
-
-    total = np.zeros(len(gaussians))
-    total[stays] = np.where(wanted, total_over(sightings, of, (len(kept),)), 0)
-    return total
-
-
 def without_revealed(
-    gaussians: Gaussians, selection: Selection, region: Region, clear: np.ndarray, revealed: np.ndarray, support: float
+    gaussians: Gaussians,
+    selection: Selection,
+    near: np.ndarray,  # [N] bool, so near a box that a smear of the object may reach it
+    clear: np.ndarray,  # [N] the weight on what views showed unhidden, see weigh
+    sightings: Sightings,
+    support: float,  # see SelectionSettings
 ) -> Selection:
-    """Remove what the removal reveals near the region and no photo vouches for (docs/method.md): `revealed` [N] as by
-    `weigh_revealed`, `clear` [N] the weight on what views showed unhidden, with the object in place; `support` as in
-    SelectionSettings.
+    """Remove what the removal reveals near the region and no photo vouches for (docs/method.md).
 
     Trainers leave smears of the object's colour and haze under and behind it, where no photo ever saw them. Without
     this rule 21 to 63 of them stay in tiles_mug, desk, rocks and real_bed, which `clear_air` does not find either.
     """
-    near = _surrounds(gaussians, region)
-    found = near & ~selection.removed & (revealed > LEAST_WEIGHT) & (clear < support * revealed)
-    return Selection(np.where(found, np.uint8(Fate.REMOVED_REVEALED), selection.fates))
+    stays = np.flatnonzero(~selection.removed)
+    kept = gaussians.take(stays)
+
+    def of(sighting: tuple[ViewBefore, np.ndarray]) -> np.ndarray:
+        view, shows = sighting
+        return label_weights(kept, view.camera, shows == Shows.OBJECT, 1, near[stays])[0]
+
+    revealed = total_over(sightings, of, (len(kept),))  # weight where the object was, without it
+    fates = selection.fates.copy()
+    fates[stays[near[stays] & (revealed > LEAST_WEIGHT) & (clear[stays] < support * revealed)]] = Fate.REMOVED_REVEALED
+    return Selection(fates)
 
 
-def _surrounds(gaussians: Gaussians, region: Region, near: float = NEAR) -> np.ndarray:
-    """[N] bool: the centre lies in a box or so near that a smear of the object may reach it."""
-    found = np.zeros(len(gaussians), bool)
-    for box in region:
-        local = (gaussians.means - box.center) @ box.axes
-        found |= (np.abs(local) < box.size / 2 + near * box.size.max()).all(1)
-    return found
+def near_region(gaussians: Gaussians, region: Region, near: float) -> np.ndarray:
+    """[N] bool: within three standard deviations of a box, or the centre within so many of the box's longest edge."""
+    return np.any(_near(gaussians, region, near), axis=0)
 
 
-def _reaches(gaussians: Gaussians, region: Region) -> np.ndarray:
-    """[N] bool: within three standard deviations of a box."""
+def _near(gaussians: Gaussians, region: Region, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """[N] bool both: which reach a box, and whose centres lie in or near one, see near_region."""
     longest = gaussians.scales.max(1)
-    found = np.zeros(len(gaussians), bool)
+    reaches, surrounds = np.zeros((2, len(gaussians)), bool)
     for box in region:
-        beyond = np.maximum(np.abs((gaussians.means - box.center) @ box.axes) - box.size / 2, 0)
+        away = np.abs((gaussians.means - box.center) @ box.axes)
+        surrounds |= (away < box.size / 2 + near * box.size.max()).all(1)
         with np.errstate(over="ignore", invalid="ignore"):
-            found |= (beyond**2).sum(1) <= (3 * longest) ** 2
-    return found
+            reaches |= (np.maximum(away - box.size / 2, 0) ** 2).sum(1) <= (3 * longest) ** 2
+    return reaches, surrounds

@@ -19,7 +19,7 @@ from ..camera import Camera
 from ..compute.jit import exact_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import surface_points
-from .outline import box_window
+from .look import box_window
 
 CELLS = 800_000  # of the grid round one box at most: more take seconds and hold too few points each
 VIEWS = 60  # at most so many, spread evenly, are gathered: further ones show the same surface
@@ -32,9 +32,10 @@ STEP = 0.6  # cells off it at most
 TURN = math.cos(math.radians(50))  # least cosine between both normals
 STEADY = math.cos(math.radians(20))  # from this cosine on its own normal bends the plane that it hands on …
 ADAPT = 0.25  # … with this weight
-SUPPORT = 4  # cells within two that must have been reached before
+SUPPORT = 4  # cells within MARGIN that must have been reached before
 THICKNESS = 0.5  # cells off its plane up to which a point belongs to the surface
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
+MARGIN = 2  # empty cells round the grid, so that none looks beyond it: SUPPORT's reach
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric 3×3 matrix
 
 
@@ -49,11 +50,8 @@ class FollowedSurface:
     points: np.ndarray  # [M, 3] on the surface
     normals: np.ndarray  # [M, 3] unit
 
-    def distance(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-    ) -> np.ndarray:
-        """[N]: how far points lie off the surface's plane nearby, in scene units; infinite where there is none."""
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """[N]: how far points [N, 3] of the scene lie off the surface's plane nearby; infinite where there is none."""
         with np.errstate(invalid="ignore"):
             local = (points - self.box.center) @ self.box.axes
             index = np.floor((local + self.half) / self.cell)
@@ -81,55 +79,61 @@ def follow_surface(
     points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
     least = pixel * max(LEAST_CELL, math.sqrt(LEAST_POINTS / points_per_cell))
     cell = max(least, float((8 * half.prod() / most_cells) ** (1 / 3)))
-    dims = tuple(int(n) for n in np.ceil(2 * half / cell))
+    dims = tuple(int(n) + 2 * MARGIN for n in np.ceil(2 * half / cell))
+
+    def points_in(view: tuple[Camera, np.ndarray]) -> np.ndarray:
+        """The view's points in the grid, [N, 3] in the box's axes; of large pictures no more than two per cell."""
+        camera, depth = view
+        distance = max(float(camera.to_camera(box.center)[2]), 1e-9)
+        step = max(1, int(0.5 * cell * camera.fx / distance))
+        _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera), step)
+        local = (points - box.center) @ box.axes
+        return local[(np.abs(local) < half).all(1)]
+
     count = min(len(views), most_views)
-    used = [views[k * len(views) // count] for k in range(count)]
-    found = parallel_map(lambda v: _points_in(box, half, cell, *v), used)
-    local = np.concatenate(found)
-    keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T), dims)
+    local = np.concatenate(parallel_map(points_in, [views[k * len(views) // count] for k in range(count)]))
+    keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T + MARGIN), dims)
     filled = np.bincount(keys, minlength=math.prod(dims)) > 0
     numbers = np.where(filled, np.cumsum(filled, dtype=np.int32) - np.int32(1), np.int32(-1))  # of cells with points
     x, rows = local.T, numbers[keys]
     values = [None, *x, *(x[a] * x[b] for a, b in PAIRS)]
     moments = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in values], axis=1)
     enough = moments[:, 0] >= LEAST_POINTS
-    cells = np.stack(np.unravel_index(np.flatnonzero(filled)[enough], dims), axis=1)
+    cells = np.flatnonzero(filled)[enough]
     points = moments[enough, 1:4] / moments[enough, :1]
-    normals = _normals(moments, numbers.reshape(dims), cells)
-    there = tuple(cells.T)
-    numbers = np.full(dims, -1, np.int32)
-    numbers[there] = np.arange(len(points))
+    normals = _normals(moments, numbers, cells, _steps(dims, 1))
+    numbers = np.full(len(numbers), -1, np.int32)
+    numbers[cells] = np.arange(len(points))
     edge = (np.abs(points) > half - seeds * box.size).any(1)
     reached = edge & ~in_region(region, box.center + points @ box.axes.T)
     planes = np.concatenate([points, normals], axis=1)
-    _grow(numbers, cells, points, normals, STEP * cell, reached, planes)
-    nearest = np.full(dims, -1, np.int32)
-    nearest[there] = np.where(reached, np.cumsum(reached) - 1, -1)
+    _grow(numbers, cells, _steps(dims, 1), _steps(dims, MARGIN), points, normals, STEP * cell, reached, planes)
+    numbers[cells] = np.where(reached, np.cumsum(reached) - 1, -1)
+    inner = slice(MARGIN, -MARGIN)
+    nearest = numbers.reshape(dims)[inner, inner, inner]
     far, (i, j, k) = scipy.ndimage.distance_transform_edt(nearest < 0, return_indices=True)
     nearest = np.where(far <= 2, nearest[i, j, k], -1).astype(np.int32)
     return FollowedSurface(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
 
 
-def _points_in(box: Box, half: np.ndarray, cell: float, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """The depth map's points in the grid, [N, 3] in the box's axes; of large pictures no more than two per cell."""
-    distance = max(float(camera.to_camera(box.center)[2]), 1e-9)
-    step = max(1, int(0.5 * cell * camera.fx / distance))
-    _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera), step)
-    local = (points - box.center) @ box.axes
-    return local[(np.abs(local) < half).all(1)]
+def _steps(dims: tuple[int, ...], reach: int) -> np.ndarray:
+    """From a cell's index in the flat grid to those of the cells round it, and to itself."""
+    around = np.indices((2 * reach + 1,) * 3).reshape(3, -1) - reach
+    return around[0] * dims[1] * dims[2] + around[1] * dims[2] + around[2]
 
 
 def _normals(
     moments: np.ndarray,  # [C, 10] of the cells with points: their number, sums of coordinates, sums of products
-    numbers: np.ndarray,  # grid of int32: such a cell's row, −1 elsewhere
-    cells: np.ndarray,  # [M, 3] those that are asked for
+    numbers: np.ndarray,  # flat grid of int32: such a cell's row, −1 elsewhere
+    cells: np.ndarray,  # [M] those that are asked for
+    steps: np.ndarray,  # to those round them
 ) -> np.ndarray:
     """The direction in which the points of a cell and its neighbours spread least, [M, 3] (Hoppe 1992)."""
     normals = np.empty((len(cells), 3))
 
     def work(lo: int, hi: int) -> None:
         total = np.zeros((hi - lo, moments.shape[1]))
-        _add_neighbours(cells[lo:hi], numbers, moments, total)
+        _add_neighbours(cells[lo:hi], numbers, steps, moments, total)
         mean = total[:, 1:4] / total[:, :1]
         covariance = np.empty((hi - lo, 3, 3))
         for k, (a, b) in enumerate(PAIRS):
@@ -141,27 +145,18 @@ def _normals(
 
 
 @exact_kernel
-def _number(numbers, i, j, k):
-    if 0 <= i < numbers.shape[0] and 0 <= j < numbers.shape[1] and 0 <= k < numbers.shape[2]:
-        return numbers[i, j, k]
-    return -1
-
-
-@exact_kernel
-def _add_neighbours(cells, numbers, moments, total):
+def _add_neighbours(cells, numbers, steps, moments, total):
     """total[i]: the sum of the moments of cell i and its 26 neighbours."""
     for i in range(len(cells)):
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                for dz in range(-1, 2):
-                    other = _number(numbers, cells[i, 0] + dx, cells[i, 1] + dy, cells[i, 2] + dz)
-                    if other >= 0:
-                        for k in range(total.shape[1]):
-                            total[i, k] += moments[other, k]
+        for step in steps:
+            other = numbers[cells[i] + step]
+            if other >= 0:
+                for k in range(total.shape[1]):
+                    total[i, k] += moments[other, k]
 
 
 @exact_kernel
-def _grow(numbers, cells, points, normals, step, reached, planes):
+def _grow(numbers, cells, near, around, points, normals, most_off, reached, planes):
     """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated.
 
     A cell hands on the plane that it was reached by, hardly bent by its own normal: at the foot of an object cells
@@ -171,29 +166,25 @@ def _grow(numbers, cells, points, normals, step, reached, planes):
     front = np.flatnonzero(reached)
     while len(front):
         for row in front:
-            for dx in range(-1, 2):
-                for dy in range(-1, 2):
-                    for dz in range(-1, 2):
-                        other = _number(numbers, cells[row, 0] + dx, cells[row, 1] + dy, cells[row, 2] + dz)
-                        if other >= 0 and not reached[other]:
-                            touched[other] = True
+            for step in near:
+                other = numbers[cells[row] + step]
+                if other >= 0 and not reached[other]:
+                    touched[other] = True
         waiting = np.flatnonzero(touched)
         touched[:] = False
         accepted = np.zeros(len(waiting), np.bool_)
         for w in range(len(waiting)):
             row = waiting[w]
             count, px, py, pz, nx, ny, nz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for dx in range(-2, 3):
-                for dy in range(-2, 3):
-                    for dz in range(-2, 3):
-                        other = _number(numbers, cells[row, 0] + dx, cells[row, 1] + dy, cells[row, 2] + dz)
-                        if other < 0 or not reached[other]:
-                            continue
-                        p, n = planes[other, :3], planes[other, 3:]
-                        sign = -1.0 if nx * n[0] + ny * n[1] + nz * n[2] < 0 else 1.0
-                        count += 1
-                        px, py, pz = px + p[0], py + p[1], pz + p[2]
-                        nx, ny, nz = nx + sign * n[0], ny + sign * n[1], nz + sign * n[2]
+            for step in around:
+                other = numbers[cells[row] + step]
+                if other < 0 or not reached[other]:
+                    continue
+                p, n = planes[other, :3], planes[other, 3:]
+                sign = -1.0 if nx * n[0] + ny * n[1] + nz * n[2] < 0 else 1.0
+                count += 1
+                px, py, pz = px + p[0], py + p[1], pz + p[2]
+                nx, ny, nz = nx + sign * n[0], ny + sign * n[1], nz + sign * n[2]
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             if count < SUPPORT or length == 0:
                 continue
@@ -202,7 +193,7 @@ def _grow(numbers, cells, points, normals, step, reached, planes):
             p, n = points[row], normals[row]
             off = nx * (p[0] - px) + ny * (p[1] - py) + nz * (p[2] - pz)
             agreement = nx * n[0] + ny * n[1] + nz * n[2]
-            if abs(off) < step and abs(agreement) > TURN:
+            if abs(off) < most_off and abs(agreement) > TURN:
                 accepted[w] = True
                 gain = math.copysign(ADAPT, agreement) if abs(agreement) > STEADY else 0.0
                 nx, ny, nz = nx + gain * n[0], ny + gain * n[1], nz + gain * n[2]

@@ -53,32 +53,28 @@ class Witness:
         return Witness(cropped(self.camera, window), *maps)
 
 
-def ask(
-    witnesses: Sequence[Witness],
-    points: np.ndarray,  # [N, 3] scene coordinates
-    tolerance: float,  # relative z within which a point lies on the surface shown
-) -> np.ndarray:
-    """What every view says of every point, [V, N] uint8, see Says."""
+def ask(witnesses: Sequence[Witness], points: np.ndarray, tolerance: float) -> np.ndarray:
+    """What every view says of every point [N, 3], [V, N] uint8, see Says.
+
+    A point lies on the surface shown within a tolerance, relative to z.
+    """
     points = np.ascontiguousarray(points, np.float64)
 
     def of(witness: Witness) -> np.ndarray:
         said = np.zeros(len(points), np.uint8)
-        depth = np.ascontiguousarray(witness.depth, np.float32)
-        _ask_range(
-            0, len(points), points, pack_camera(witness.camera), witness.hidden, witness.beside, depth, tolerance, said
-        )
+        maps = witness.hidden, witness.beside, np.ascontiguousarray(witness.depth, np.float32)
+        _ask_range(0, len(points), points, pack_camera(witness.camera), *maps, tolerance, said)
         return said
 
     return np.array(parallel_map(of, witnesses), np.uint8).reshape(len(witnesses), len(points))
 
 
-def total_over(items: Sequence[T], work: Callable[[T], np.ndarray | None], shape: tuple[int, ...]) -> np.ndarray:
-    """The sum of arrays of a shape that `work` makes of items, such as views; None counts as zeros."""
+def total_over(items: Sequence[T], work: Callable[[T], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """The sum of arrays of a shape that `work` makes of items, such as views."""
     total = np.zeros(shape)
     for start in range(0, len(items), AT_ONCE):
         for part in parallel_map(work, items[start : start + AT_ONCE]):
-            if part is not None:
-                total += part
+            total += part
     return total
 
 
@@ -100,11 +96,11 @@ def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
             said[i] = BESIDE if beside[row, col] else SEEN
 
 
-def texture(
-    photo: np.ndarray,  # [H, W, 3] uint8
-    shown: np.ndarray,  # [H, W] bool, pixels that count
-) -> np.ndarray:
-    """Band-passed luminance, [H, W] int8 in half grey levels: what tells places apart, whatever the light."""
+def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """Band-passed luminance, [H, W] int8 in half grey levels: what tells places apart, whatever the light.
+
+    Of a photo [H, W, 3] uint8 only the pixels shown, [H, W] bool, count.
+    """
     grey, weight = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32), shown.astype(np.float32)
 
     def blurred(sigma: float) -> np.ndarray:
@@ -126,7 +122,6 @@ class Textures:
     def make(cls, witnesses: Sequence[Witness], most: int = 32, shrink: int = 1) -> Textures:
         """Of `most` views, evenly chosen, in pictures smaller by a whole factor."""
         count = min(len(witnesses), most)
-        used = [witnesses[k * len(witnesses) // count] for k in range(count)]
 
         def of(witness: Witness) -> tuple[np.ndarray, np.ndarray]:
             hidden = witness.hidden | witness.beside  # the object's edge is no texture of what is beside it
@@ -139,15 +134,13 @@ class Textures:
             camera[16:] = w, h
             return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
 
+        used = [witnesses[k * len(witnesses) // count] for k in range(count)]
         cameras, values = zip(*parallel_map(of, used))
         sizes = np.array([len(v) for v in values], np.int64)
         return cls(np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
 
-    def agreement(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates, on a surface
-    ) -> float:
-        """How alike photos look at the points, 0 to 1: the share of their texture's energy that they have in common.
+    def agreement(self, points: np.ndarray) -> float:
+        """How alike photos look at points [N, 3], 0 to 1: the share of their texture's energy that they have in common.
 
         Σ n m² / Σ t² over points that at least three photos show, t a photo's value there, m their mean. It is
         greatest where the points lie on the real surface (plane sweep: Collins 1996).
@@ -157,8 +150,7 @@ class Textures:
 
     def energy(self, points: np.ndarray) -> np.ndarray:
         """[N, 2]: what the photos have in common at each point, n m², and all they show there, Σ t²."""
-        energy = np.zeros((len(points), 2))
-        points = np.ascontiguousarray(points, np.float64)
+        energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
         run_ranges(_compare_range, len(points), points, self.cameras, self.starts, self.values, AGREEING, energy)
         return energy
 

@@ -14,7 +14,7 @@ from ..presets import RemovalSettings
 from ..stages.charts import Chart
 from ..stages.contact import find_contact
 from ..stages.ground import look_at
-from ..stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
+from ..stages.lifting import Lifted, bare_photos, lift
 from ..stages.masks import Masks
 from ..stages.occluder import support_first
 from ..stages.reflection import Reflection, find_reflection
@@ -76,7 +76,7 @@ def find_light(
     reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
     if isinstance(reflection, Reflection):
         bare = bare_photos(reflection, witnesses)
-        witnesses = [replace(w, photo=photo) for w, (photo, _, _) in zip(witnesses, bare)]
+        witnesses = [replace(w, photo=photo) for w, (photo, *_) in zip(witnesses, bare)]
         grounds = look_at(planes, masks.views, witnesses, region)
     if settings.shadow == "mask":
         shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
@@ -87,16 +87,7 @@ def find_light(
 
 def undo_light(scene: Gaussians, masks: Masks, surfaces: Surfaces, views: Sequence[ViewState], found: Found) -> Lifted:
     """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
-    witnesses: Sequence[Witness] = surfaces.witnesses(views)
-    first = None
-    if found.reflection is not None:
-        first = subtract_reflection(scene, masks.removed, found.reflection, witnesses)
-        scene, witnesses = first.scene(scene), [replace(w, photo=p) for w, p in zip(witnesses, first.photos)]
-    if found.shadow is None:
-        assert first is not None
-        return first
-    lifted = lift_shadow(scene, masks.removed, found.shadow, witnesses)
-    return lifted if first is None else lifted.after(first)
+    return lift(scene, masks.removed, surfaces.witnesses(views), found.reflection, found.shadow)
 
 
 def with_contact(found: Found, charts: Sequence[Chart]) -> Found:

@@ -18,7 +18,7 @@ from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
 from ..stages.charts import Chart, extent, pictured
-from ..stages.recolour import recoloured
+from ..stages.lifting import recoloured
 from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.seed import OWN_RULES
 from ..stages.selection import near_region

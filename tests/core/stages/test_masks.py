@@ -23,7 +23,7 @@ from gimp3d.io.ply import read_ply
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import Backend, Drawing, render, surface_depth
-from gimp3d.stages import look, selection, targets
+from gimp3d.stages import look, selection
 from gimp3d.stages import masks as stage
 from gimp3d.stages.masks import MaskSettings, ViewMasks, find_masks
 from gimp3d.stages.selection import Fate, SelectionSettings
@@ -294,7 +294,7 @@ def test_every_view_is_drawn_a_fixed_number_of_times(monkeypatch: pytest.MonkeyP
 
         return run
 
-    for module, name in ((look, "drawing"), (targets, "render"), (selection, "label_weights")):
+    for module, name in ((look, "drawing"), (stage, "drawing"), (look, "render"), (selection, "label_weights")):
         monkeypatch.setattr(module, name, counted(getattr(module, name)))
     per_view = []
     for count in (6, 12):
