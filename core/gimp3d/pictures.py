@@ -84,7 +84,7 @@ def of_depth(
 
 
 def of_reference(completed: Completed, field: MappingField | None) -> list[Picture]:
-    image, name = completed.appearance.image, completed.camera.id
+    image, name = completed.image, completed.camera.id
     shown = [Picture("appearance", f"The reference without the object, {name}", image, (completed.target,))]
     if field is not None:
         shown.append(Picture("mapping", f"Mapping field of {name}", image, (field.rows, field.cols)))

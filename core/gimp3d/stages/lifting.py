@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 from ..geometry import Window, dilated, window_round
 from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
-from .charts.hits import Hits, first_hits, pictured
+from .charts.plane import Hits, first_hits, pictured
 from .ground import Ground
 from .recolour import recoloured
 from .reflection import VISIBLE, Reflection

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import scipy.ndimage
 
-from ..camera import Camera
 from ..errors import BadInput
 from ..geometry import colours_at, disparity_of, sees
 from ..presets import RemovalSettings
@@ -20,7 +19,7 @@ from ..priors.calls import Call
 from ..priors.inpaint import inpaint_reference
 from ..priors.monodepth import depth_prior, looks
 from ..priors.pasting import paste_picture
-from ..stages.charts import CHART, Chart, chart_number
+from ..stages.charts import CHART, Chart, chart_number, pictured
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.propagate import Reference
 from ..stages.reference import rim
@@ -41,14 +40,9 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class Completed:
-    """A reference without the object; arrays [H, W] of its camera."""
+class Completed(Reference):
+    """A reference without the object; its target is what views need of what was completed."""
 
-    camera: Camera
-    appearance: Appearance
-    depth: np.ndarray  # float32 z of the completed surface
-    target: np.ndarray  # bool, what views need of what was completed
-    source: np.ndarray  # bool, what photos show of the surface round it
     charts: tuple[Chart, ...]  # that views take their depths from; none: from their splats
 
 
@@ -119,24 +113,19 @@ def texels_to_fill(chart: Chart, number: int, views: Sequence[ViewState]) -> tup
 
 def carried_over(chart: Chart, done: Sequence[Reference]) -> Chart:
     """The chart with what completed references show of its hole: a picture that was given rules where it sees it."""
-    points = chart.camera.unproject(chart.camera.pixel_centres(), chart.depth.astype(np.float64))
+    points = chart.points()
+    image, photos, known, hole = (a.copy() for a in (chart.image, chart.photos, chart.known, chart.hole))
     for reference in done:
-        open_points = np.argwhere(~chart.known)
-        if not len(open_points):
-            break
-        rows, cols = open_points.T
+        rows, cols = np.nonzero(~known)
         uv, _ = reference.camera.project(points[rows, cols])
         same = SAME_TEXELS / reference.camera.fx if reference.camera.split == CHART else SAME
         clean = cv2.erode((reference.target | reference.source).astype(np.uint8), CUBIC) > 0
         completed = np.where(reference.target & clean, reference.depth, 0)
         seen = sees(reference.camera, completed, points[rows, cols], same)
-        image, known, hole = chart.image.copy(), chart.known.copy(), chart.hole.copy()
-        photos = chart.photos.copy()
         shown = rows[seen], cols[seen]
         image[shown] = colours_at(reference.image, uv[seen], cv2.INTER_CUBIC)
-        known[shown], hole[shown], photos[shown] = True, False, 1
-        chart = replace(chart, image=image, known=known, hole=hole, photos=photos)
-    return chart
+        photos[shown], known[shown], hole[shown] = 1, True, False
+    return replace(chart, image=image, photos=photos, known=known, hole=hole)
 
 
 def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSettings, call: Call) -> Appearance:
@@ -194,7 +183,11 @@ def paint_view(
     view: ViewState, charts: Sequence[Chart], settings: RemovalSettings, picture: np.ndarray | None, call: Call
 ) -> Appearance:
     """The view without the object: the given picture, or what charts show and the provider's fill for the rest."""
-    masks, (base, seen) = view.left, _shown_by(charts, view)
+    masks, base, seen = view.left, view.painted, np.zeros(view.left.target.shape, bool)
+    if view.hits is not None:
+        shown, known, _ = pictured(charts, view.hits)
+        seen = masks.target & known
+        base = np.where(seen[..., None], shown, base)
     if picture is not None:
         return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
     filled = inpaint_reference(
@@ -202,15 +195,3 @@ def paint_view(
     )
     share = seen.sum() / max(1, masks.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
-
-
-def _shown_by(charts: Sequence[Chart], view: ViewState) -> tuple[np.ndarray, np.ndarray]:
-    """The view with what charts know of its hole, and where that is [H, W] bool."""
-    image, seen = view.painted.copy(), np.zeros(view.left.target.shape, bool)
-    for number, chart in enumerate(charts):
-        assert view.hits is not None
-        on = view.left.target & (view.hits.chart == number)
-        on[on] = chart.known[view.hits.rows[on], view.hits.cols[on]]
-        image[on] = chart.image[view.hits.rows[on], view.hits.cols[on]]
-        seen |= on
-    return image, seen

@@ -24,7 +24,7 @@ from ..stages.seed import OWN_RULES
 from ..stages.selection import near_region
 from ..stages.witness import Witness, total_over
 from ..view_state import ViewState
-from .coverage import emptied
+from .carrying import emptied
 
 LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them (kitchen_monkey −0.2 dB, real_bed −0.1)
 ROUND = 24  # px round the object in which photos teach

@@ -11,7 +11,7 @@ from ..box import Region
 from ..errors import IllPosed
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
-from ..stages.charts import Chart, LaidPlane, Plane, draw_charts, find_planes, lay_planes
+from ..stages.charts import Chart, Laid, Plane, draw_charts, find_planes, lay_planes
 from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
 from ..stages.masks import Masks
 from ..stages.selection import Selection
@@ -24,7 +24,7 @@ class Surfaces:
     """What is round the object, and where photos show it; tuples are of the masks' views."""
 
     planes: tuple[Plane, ...]
-    laid: tuple[LaidPlane, ...]  # those of which the object hides something
+    laid: tuple[Laid, ...]  # those of which the object hides something
     selection: Selection  # without what photos show to be surface
     objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift

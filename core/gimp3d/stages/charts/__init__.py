@@ -8,17 +8,17 @@ from __future__ import annotations
 import re
 
 from .draw import Chart as Chart
-from .draw import LaidPlane as LaidPlane
 from .draw import draw_charts as draw_charts
 from .draw import lay_planes as lay_planes
+from .find import CHART as CHART
 from .find import ChartSettings as ChartSettings
+from .find import Laid as Laid
 from .find import find_planes as find_planes
-from .hits import Hits as Hits
-from .hits import first_hits as first_hits
-from .hits import pictured as pictured
+from .plane import Hits as Hits
 from .plane import Plane as Plane
 from .plane import extent as extent
-from .surface import CHART as CHART
+from .plane import first_hits as first_hits
+from .plane import pictured as pictured
 
 
 def chart_number(reference: str | None) -> int | None:

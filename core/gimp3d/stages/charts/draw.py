@@ -11,7 +11,6 @@ import numpy as np
 import scipy.ndimage
 
 from ...box import Region, in_region
-from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
 from ...solvers.variogram import carried
@@ -19,10 +18,8 @@ from ..footprint import GRAIN, shows_object
 from ..masks import ViewMasks
 from ..mosaic import mosaic
 from ..witness import Says, Textures, Witness, ask
-from .find import TOLERANCE, ChartSettings, grid
-from .hits import Facing
-from .plane import Plane, extent
-from .surface import TELLING, Laid, facing_camera, lay_surface, pixel_size
+from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_size
+from .plane import Facing, Plane, Surface, extent
 
 VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
@@ -54,37 +51,25 @@ class Chart(Facing):
     reason: str
 
 
-@dataclass(frozen=True)
-class LaidPlane:
-    """A plane with the camera that faces what the object hides of it, and where its surface lies."""
-
-    plane: Plane
-    others: tuple[Plane, ...]  # that it may meet
-    camera: Camera
-    surface: Laid
-
-
 def lay_planes(
     planes: Sequence[Plane],
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],  # of the same views
     region: Region,
     settings: ChartSettings = ChartSettings(),
-) -> tuple[LaidPlane, ...]:
+) -> tuple[Laid, ...]:
     """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
     textures = Textures.make(witnesses)
     laid = []
     for plane in planes:
-        placed = _placed(plane, region, views, witnesses, settings)
-        if placed is not None:
-            camera, away = placed
-            surface = lay_surface(camera, away, plane, region, views, witnesses, textures, settings)
-            laid.append(LaidPlane(plane, tuple(p for p in planes if plane.crosses(p)), camera, surface))
+        if (flat := _placed(plane, region, views, witnesses, settings.largest)) is not None:
+            surface = lay_surface(flat, region, views, witnesses, textures, settings)
+            laid.append(replace(surface, others=tuple(p for p in planes if plane.crosses(p))))
     return tuple(laid)
 
 
 def draw_charts(
-    laid: Sequence[LaidPlane],
+    laid: Sequence[Laid],
     witnesses: Sequence[Witness],
     region: Region,
     marked: Sequence[np.ndarray] = (),  # [H, W] bool, of the witnesses' views: to be filled whatever they show
@@ -121,43 +106,44 @@ class _Shown:
     alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
 
 
-def _chart(one: LaidPlane, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
-    plane, surface = one.plane, one.surface
-    scatter = _scatter(surface.texels, one.others, witnesses)
+def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
+    points, shape = laid.points(), laid.depth.shape
+    texels = points.reshape(-1, 3)
+    scatter = _scatter(texels, laid.others, witnesses)
     tolerance = max(TOLERANCE, scatter)
-    shown = _shown(surface.points, plane, witnesses, tolerance)
+    shown = _shown(points, laid.plane, witnesses, tolerance)
     below, rests, foreign = _told_by_colours(
         shown,
-        _object_colours(plane, witnesses, tolerance),
-        in_region(region, surface.texels).reshape(surface.depth.shape),
-        _marked(surface.texels, witnesses, marked, surface.depth.shape),
+        _object_colours(laid.plane, witnesses, tolerance),
+        in_region(region, texels).reshape(shape),
+        _marked(texels, witnesses, marked).reshape(shape),
     )
     hole = _without_islands((shown.hole & ~below) | rests, ((shown.photos < 2) & shown.there) | below)
     below &= ~hole
     return Chart(
-        plane,
-        one.camera,
-        surface.depth,
+        laid.plane,
+        laid.camera,
+        laid.depth,
         shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
         known=(shown.known | below) & ~hole & ~foreign,
         hole=hole,
-        kind=surface.kind,
+        kind=laid.kind,
         photos=np.where(below, shown.hiding, shown.photos),
         below=below,
         rests=rests,
-        agreement=surface.agreement,
-        noise=surface.noise,
+        agreement=laid.agreement,
+        noise=laid.noise,
         scatter=scatter,
         tolerance=tolerance,
-        reason=surface.reason,
+        reason=laid.reason,
     )
 
 
 def _placed(
-    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], settings: ChartSettings
-) -> tuple[Camera, float] | None:
-    """The camera that faces what the object hides of a plane and a margin to fill it from, and the plane's z there.
+    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], largest: float
+) -> Surface | None:
+    """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
 
     None if the object hides nothing of it, or no view faces what it hides.
     """
@@ -168,15 +154,13 @@ def _placed(
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
         return None
-    cell = 4 * diagonal / PLACES
-    low, high = (np.array([x[hole], y[hole]]).min(1) - cell, np.array([x[hole], y[hole]]).max(1) + cell)
+    there, cell = np.array([x[hole], y[hole]]), 4 * diagonal / PLACES
+    low, high = there.min(1) - cell, there.max(1) + cell
     size = high - low
     size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
     place = plane.points(*((low + high) / 2)[:, None])[0]
     texel = pixel_size(place, plane.normal, views)
-    if not math.isfinite(texel):
-        return None
-    return facing_camera(plane, place, size, max(texel, float(size.max()) / settings.largest))
+    return flat_surface(plane, place, size, max(texel, float(size.max()) / largest)) if texel < math.inf else None
 
 
 def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
@@ -239,8 +223,8 @@ def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
     foreign, usual = (_unlike_near(shown.image, texels, known) for texels in (beside, around))
     unlike_object, usually = (_unlike_near(shown.image, texels, hole) for texels in (beside, around))
     found = np.zeros_like(beside)
-    found[beside] = foreign > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
-    found[beside] &= unlike_object < np.median(usually)
+    unusual = foreign > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
+    found[beside] = unusual & (unlike_object < np.median(usually))
     return found
 
 
@@ -261,11 +245,8 @@ def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np
     return np.sqrt(np.where(np.isfinite(least), least, 0))
 
 
-def _without_islands(
-    hole: np.ndarray,  # [H, W] bool
-    doubtful: np.ndarray,  # [H, W] bool
-) -> np.ndarray:
-    """The hole with what is doubtful in it: one photo's word through a gap, or what is below masks, joins the outside.
+def _without_islands(hole: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the hole with what is doubtful in it: one photo's word through a gap, or what is below masks.
 
     The object's foot may have the surface's colours, and what stands before it shows through its mask.
     """
@@ -294,25 +275,21 @@ def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float
     return np.concatenate(parallel_map(of, witnesses))
 
 
-def _marked(
-    points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray], shape: tuple[int, ...]
-) -> np.ndarray:
-    """[H, W] bool: texels at points [H·W, 3] that the user marked in some view."""
+def _marked(points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> np.ndarray:
+    """[N] bool: points [N, 3] that the user marked in some view."""
     found = np.zeros(len(points), bool)
     for witness, mask in zip(witnesses, marked):
         if mask.any():
             found |= sees(witness.camera, mask.astype(np.float32), points, np.inf)
-    return found.reshape(shape)
+    return found
 
 
-def _scatter(
-    surface: np.ndarray,  # [N, 3]
-    others: Sequence[Plane],  # that it may meet
-    witnesses: Sequence[Witness],
-) -> float:
-    """How far, relative to z, the views' drawn surfaces scatter about this one: three standard deviations."""
+def _scatter(surface: np.ndarray, others: Sequence[Plane], witnesses: Sequence[Witness]) -> float:
+    """How far, relative to z, the views' drawn surfaces scatter about points [N, 3] of one: three standard deviations.
+
+    What lies behind the others that it may meet, such as a wall, says nothing of how a floor's depths scatter.
+    """
     before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
-    # what lies behind a wall says nothing of how the floor's depths scatter
     surface = surface[before] if before.sum() > TELLING else surface
     some, off = surface[:: max(1, len(surface) // SURFACE)], [np.zeros(0)]
     for witness in witnesses:

@@ -1,23 +1,27 @@
-"""The planes that run into what the object hid: sought among drawn depths, settled where photos agree on them."""
+"""The planes that run into what the object hid, settled where photos agree on them, and where the surface at each lies.
+
+Planes are sought among drawn depths. Their surfaces lie on them, or on the relief that the views draw over them.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from ...box import Region, in_region
+from ...camera import Camera
 from ...compute.threads import parallel_map
-from ...geometry import SOLID, surface_points
+from ...geometry import SOLID, WHOLE, framed, surface_points, window_round
 from ...schema import AtLeastOne, Share
+from ...solvers.thin_plate import thin_plate
 from ..masks import ViewMasks
 from ..witness import AGREEING, Says, Textures, Witness, ask
-from .plane import Plane, extent, largest_plane
+from .plane import Plane, Surface, extent, largest_plane
 
 TOLERANCE = 0.05  # relative z by which a view's surface must be nearer to hide a point: rough scans scatter by 3 to 9 %
 MIXED_RIM = 2.0  # px beside the object whose depths may be its own
@@ -34,6 +38,13 @@ SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sough
 TILT = 0.2  # slope by which it is tilted to begin with: rough depths were 8° off (kitchen_monkey)
 TRIED = 3  # planes of the coarsest level that are followed up
 STEP, COARSE_STEP, FINE_STEP = 0.01, 0.0025, 1e-4  # the pattern search's first and last ones: offset in diagonals
+CHART = "chart"  # split of the cameras that face surfaces
+MARGIN = 8  # px of a view round the part that may show the surface
+CELL = 2  # px of such a camera, side of the cells in which drawn surface is gathered
+ENOUGH_POINTS = 3  # of a cell
+TELLING = 100  # cells or texels that tell how depths lie
+HEIGHT = 0.25  # diagonals of the region, of a relief at most: what is higher stands on the surface
+SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
 
 
 @dataclass(frozen=True)
@@ -91,9 +102,8 @@ def surface_beside(
         points = surface_points(view.camera, depth, step=step)[2]
         return points, np.broadcast_to(view.camera.centre, points.shape)
 
-    parts = parallel_map(lambda p: of(*p), list(zip(views, witnesses)))
-    points, eyes = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    return points, eyes
+    points, eyes = zip(*parallel_map(lambda p: of(*p), zip(views, witnesses)))
+    return np.concatenate(points), np.concatenate(eyes)
 
 
 def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> _Round:
@@ -155,11 +165,10 @@ def find_planes(
     return tuple(planes)
 
 
-def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places on a square, [count, count] each."""
+def grid(half: float, count: int) -> np.ndarray:
+    """x and y of places on a square, [2, count, count]."""
     side = ((np.arange(count) + 0.5) / count * 2 - 1) * half
-    x, y = np.meshgrid(side, side)
-    return x, y
+    return np.array(np.meshgrid(side, side))
 
 
 def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
@@ -189,11 +198,13 @@ class _Claim:
         points, there = self.plane.points(x, y), np.ones(len(x), bool)
         for other, side in self.bounds:
             there &= side * other.local(points)[:, 2] > 0
-        return partial(self._agreement, x[there], y[there], self.own.some(count**2 // OWN), textures)
+        x, y, own = x[there], y[there], self.own.some(count**2 // OWN)
 
-    def _agreement(self, x: np.ndarray, y: np.ndarray, own: _Round, textures: Textures, pose: np.ndarray) -> float:
-        round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
-        return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+        def by(pose: np.ndarray) -> float:
+            round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
+            return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+
+        return by
 
     def at(self, pose: np.ndarray) -> Plane:
         """The guess moved and tilted by [3]: offset over `half`, two slopes."""
@@ -254,3 +265,100 @@ def _climbed(agreement: Callable[[np.ndarray], float], start: np.ndarray, least:
         else:
             step /= 2
     return best, at
+
+
+@dataclass(frozen=True)
+class Laid(Surface):
+    """A surface where it lies as far as photos tell."""
+
+    kind: str  # plane | relief
+    agreement: float  # of photos on it, see Textures
+    reason: str
+    noise: float = np.nan  # median distance of the views' drawn surfaces from the plane, scene units
+    others: tuple[Plane, ...] = ()  # planes that it may meet
+
+
+def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float) -> Surface:
+    """A rectangle of a plane, of a size [2] and round a place, as a camera faces it, with texels of one side."""
+    width, height = (int(n) for n in np.ceil(size / texel))
+    away = 4 * float(np.linalg.norm(size))
+    rotation = np.stack([plane.right, -plane.down, -plane.normal])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (place + away * plane.normal)
+    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART)
+    return Surface(plane, camera, np.full((height, width), away, np.float32))
+
+
+def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
+    """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
+    density = []
+    for camera in (v.camera for v in views):
+        z, towards = camera.project(place[None])[1][0], camera.centre - place
+        cosine = float((towards @ normal) / np.linalg.norm(towards))
+        if z > 0 and cosine > 0:
+            density.append(camera.fx * camera.fy * cosine / z**2)
+    return 1 / math.sqrt(float(np.percentile(density, 90))) if density else math.inf
+
+
+def lay_surface(
+    flat: Surface,  # at the plane
+    region: Region,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    settings: ChartSettings = ChartSettings(),
+    enough: float = math.inf,  # points that tell where a few texels lie, where views show more
+) -> Laid:
+    """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
+
+    def at(offset: np.ndarray | float, kind: str) -> Laid:
+        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, "")
+        agreement = textures.agreement(laid.points().reshape(-1, 3))
+        return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
+
+    level, diagonal = at(0.0, "plane"), extent(region)
+    offset, known = _drawn_surface(flat, views, witnesses, HEIGHT * diagonal, enough)
+    if known.sum() < TELLING:
+        return level
+    completed = np.nan_to_num(thin_plate(offset, known.astype(float), np.ones(known.shape, bool))).astype(np.float32)
+    relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
+    # splats are drawn a little behind the surface that they show: new ones must lie where they do
+    near = offset[known & (np.abs(offset) < SINKS * diagonal)]
+    sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
+    return replace(
+        relief if 1 - relief.agreement < settings.relief * (1 - level.agreement) else sunk,
+        reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
+        noise=float(np.median(np.abs(offset[known]))),
+    )
+
+
+def _drawn_surface(
+    flat: Surface, views: Sequence[ViewMasks], witnesses: Sequence[Witness], height: float, enough: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """z of what views draw no higher than so much over a plane less the plane's, in cells of a few texels, and where
+    that is known. Both [h, w]; the median over the views' points.
+    """
+    camera, away = flat.camera, flat.depth[0, 0]
+    h, w = -(-camera.height // CELL), -(-camera.width // CELL)
+    ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
+    corners = camera.unproject(ends, np.full(4, away, float))
+    middle = corners.mean(0)
+
+    def of(view: ViewMasks, witness: Witness) -> np.ndarray:
+        uv, front = view.camera.project(corners)
+        window = window_round(uv, view.camera, MARGIN) if (front > 0).all() else WHOLE
+        z_there = float(view.camera.project(middle[None])[1][0])
+        side = CELL * away / camera.fx * view.camera.fx / z_there if z_there > 0 else 1  # of a cell, in px
+        step = max(1, int(side * math.sqrt(len(views) / enough)))
+        points = surface_points(view.camera, surface_depth_beside(view, witness), window, step)[2]
+        points = points[np.abs(flat.plane.local(points)[:, 2]) < height]
+        _, rows, cols, z = framed(camera, points)
+        return np.stack([rows // CELL * w + cols // CELL, z], -1)
+
+    found = np.concatenate(parallel_map(lambda p: of(*p), zip(views, witnesses)))
+    key, z = found[np.lexsort((found[:, 1], found[:, 0]))].T
+    count = np.bincount(key.astype(int), minlength=h * w)
+    known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
+    value[known] = z[(np.cumsum(count) - count + count // 2)[known]]
+    value, known = value.reshape(h, w), known.reshape(h, w)
+    return np.where(known, value - away, 0), known

@@ -15,7 +15,7 @@ from gimp3d.geometry import window_mask
 from gimp3d.raster import footprint, render_bytes, surface_depth, touched_window
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Rule
-from gimp3d.steps.coverage import MARGIN, redrawn, still_open
+from gimp3d.steps.carrying import MARGIN, redrawn, still_open
 
 
 @cache
