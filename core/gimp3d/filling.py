@@ -17,26 +17,24 @@ from .stages.charts import Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
 from .stages.refine import observed, refine_gaussians
-from .steps.carrying import (
+from .steps.references import (
+    Completed,
+    Turn,
     after_reference,
     ask_to_refine,
+    carried_over,
+    complete_view_depth,
     emptied,
+    left_to_charts,
     map_reference,
+    paint_chart,
+    paint_view,
     paint_views,
     seed_surface,
     settle_seeds,
     snapped,
-    with_answers,
-)
-from .steps.completion import (
-    Completed,
-    Turn,
-    carried_over,
-    complete_view_depth,
-    left_to_charts,
-    paint_chart,
-    paint_view,
     texels_to_fill,
+    with_answers,
 )
 from .steps.relearning import take_painted_colours
 from .view_state import ViewState, open_pixels

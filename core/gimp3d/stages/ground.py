@@ -50,7 +50,7 @@ def _walls(
 ) -> list[Plane]:
     """Planes beside the object, which it hides nowhere, that hold most of what stands round it."""
     diagonal = extent(region)
-    points, _ = surface_beside(views, witnesses, WALL_POINTS)
+    points = surface_beside(views, witnesses, WALL_POINTS).points
     points = points[(np.abs(points - planes[0].origin) < REACH * diagonal).all(1)]
     for plane in planes:
         points = points[plane.local(points)[:, 2] > WALL_INLIER * diagonal]

@@ -24,7 +24,7 @@ from ..stages.seed import OWN_RULES
 from ..stages.selection import near_region
 from ..stages.witness import Witness, total_over
 from ..view_state import ViewState
-from .carrying import emptied
+from .references import emptied
 
 LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them (kitchen_monkey −0.2 dB, real_bed −0.1)
 ROUND = 24  # px round the object in which photos teach
@@ -49,8 +49,8 @@ class Relearned:
     def scene(self, scene: Gaussians) -> Gaussians:
         """The scene with them."""
         arrays = {name: getattr(scene, name).copy() for name in LEARNED}
-        for name, array in arrays.items():
-            array[self.rows] = getattr(self.gaussians, name)
+        for name in LEARNED:
+            arrays[name][self.rows] = getattr(self.gaussians, name)
         return replace(scene, **arrays)
 
 
@@ -80,16 +80,8 @@ def relearn(
     place, elsewhere = total_over(showing, weights, (2, len(kept)))
     learns = near & (place > SHOWN) & (place > SHARE * (place + elsewhere))
     observations = [observed_round(v, charts) for v in emptied(kept, showing)]
-    refined = refine_gaussians(
-        kept.take(~learns),
-        kept.take(learns),
-        observations,
-        settings.refine,
-        settings.random_seed,
-        lambda _, *step: progress("relearn", *step),
-        LEARNED,
-        ROUND,
-    )
+    how = settings.refine, settings.random_seed, lambda _, *step: progress("relearn", *step), LEARNED, ROUND
+    refined = refine_gaussians(kept.take(~learns), kept.take(learns), observations, *how)
     rows = np.flatnonzero(~removed)[learns] if refined.steps else np.zeros(0, int)
     reason = f"{len(rows)} Gaussians round the object: {refined.reason}"
     return Relearned(rows, refined.gaussians.take(np.arange(len(rows))), refined.confidence, reason)
@@ -100,17 +92,13 @@ def take_painted_colours(kept: Gaussians, added: Gaussians, views: Sequence[View
 
     What they show elsewhere holds them.
     """
-    painted = [(v, np.isin(v.rules, OWN_RULES)) for v in views if v.rules is not None]
-    of_object = [(v.masks.silhouette | v.masks.target) & ~own for v, own in painted]
-    witnesses = [
-        Witness(v.camera, v.painted, hidden, np.zeros_like(hidden), v.masks.depth_before)
-        for (v, _), hidden in zip(painted, of_object)
-    ]
-    whole, wanted = kept.extended(added), [own for _, own in painted]
+    wanted = [np.isin(v.rules, OWN_RULES) for v in views if v.rules is not None]
+    views = [v for v in views if v.rules is not None]
+    hidden = [(v.masks.silhouette | v.masks.target) & ~own for v, own in zip(views, wanted)]
+    witnesses = [Witness(v.camera, v.painted, h, np.zeros_like(h), v.masks.depth_before) for v, h in zip(views, hidden)]
+    whole, painted = kept.extended(added), [v.painted for v in views]
     may = (np.arange(len(whole)) < len(kept)) & whole.usable & np.isfinite(whole.opacity_logits)
-    rows, sh = recoloured(
-        whole, np.zeros(len(whole), bool), witnesses, [v.painted for v, _ in painted], wanted, wanted, 0, may
-    )
+    rows, sh = recoloured(whole, np.zeros(len(whole), bool), witnesses, painted, wanted, wanted, 0, may)
     seen = np.abs(sh[:, 0] - kept.sh[rows, 0]).max(1) > VISIBLE / SH_C0
     rows, sh = rows[seen], sh[seen]
     reason = f"{len(rows)} Gaussians before the new ones take the colours that are painted there"

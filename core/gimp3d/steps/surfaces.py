@@ -91,22 +91,16 @@ class Charted:
 
 
 def chart_surfaces(
-    scene: Gaussians,
-    region: Region,
-    masks: Masks,
-    surfaces: Surfaces,
-    views: Sequence[ViewState],
-    settings: RemovalSettings,
+    scene: Gaussians, region: Region, surfaces: Surfaces, views: Sequence[ViewState], settings: RemovalSettings
 ) -> Charted:
     """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
-    assert settings.charts is not None
-    witnesses, marked = surfaces.witnesses(views), surfaces.marked
+    witnesses, marked, masks = surfaces.witnesses(views), surfaces.marked, [v.masks for v in views]
     charts = draw_charts(surfaces.laid, witnesses, region, marked)
     if not charts:
-        return Charted((), masks.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
+        return Charted((), surfaces.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
     tolerance, witnesses = max(c.tolerance for c in charts), hiding_rests(witnesses, charts)
-    selection = clear_air(scene, region, masks.selection, masks.views, witnesses, charts, settings.clearing)
-    targets = chart_targets(scene, selection, masks.views, witnesses, charts, tolerance, marked, settings.clearing)
+    selection = clear_air(scene, region, surfaces.selection, masks, witnesses, charts, settings.clearing)
+    targets = chart_targets(scene, selection, masks, witnesses, charts, tolerance, marked, settings.clearing)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
-    cleared = int((selection.removed & ~masks.removed).sum())
+    cleared = int((selection.removed & ~surfaces.selection.removed).sum())
     return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))

@@ -211,7 +211,7 @@ def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(fl
 
 def test_a_claim_s_pose_leads_to_the_plane() -> None:
     plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION)
-    claim = find._Claim(plane, find._Round(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
+    claim = find._Claim(plane, find.Beside(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
     other = plane.tilted(0.1, 0.2, -0.1)
     x, y = np.random.default_rng(3).normal(size=(2, 20))
     reached = claim.at(claim.pose_of(other))
@@ -416,9 +416,8 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     axes = pose[:3, :3]
     plane = Plane(offset * normal, axes[0], axes[1], normal)
     there = np.ones((h, w), bool)
-    return Chart(
-        plane, camera, depth, there, grey, no, no, "plane", no.astype(np.uint16), no, no, 1.0, 0.0, 0.0, 0.01, ""
-    )
+    laid, shown = (plane, camera, depth, "plane", 1.0, 0.0, (), ""), (there, grey, no, no)
+    return Chart(*laid, *shown, no.astype(np.uint16), no, no, scatter=0.0, tolerance=0.01)
 
 
 def rays_of(camera: Camera) -> np.ndarray:

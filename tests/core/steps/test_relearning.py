@@ -19,7 +19,7 @@ from gimp3d.stages import refine
 from gimp3d.stages.charts import pictured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.propagate import Rule
-from gimp3d.steps.carrying import emptied
+from gimp3d.steps.references import emptied
 from gimp3d.steps.relearning import observed_round, take_painted_colours
 
 SETTINGS = replace(PRESETS["balanced"], refine=replace(PRESETS["balanced"].refine, steps=50), shadow="off")

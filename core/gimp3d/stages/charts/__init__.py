@@ -7,18 +7,14 @@ from __future__ import annotations
 
 import re
 
-from .draw import Chart as Chart
-from .draw import draw_charts as draw_charts
-from .draw import lay_planes as lay_planes
-from .find import CHART as CHART
-from .find import ChartSettings as ChartSettings
-from .find import Laid as Laid
-from .find import find_planes as find_planes
-from .plane import Hits as Hits
-from .plane import Plane as Plane
-from .plane import extent as extent
-from .plane import first_hits as first_hits
-from .plane import pictured as pictured
+from .draw import Chart, draw_charts, lay_planes
+from .find import CHART, ChartSettings, Laid, find_planes
+from .plane import Hits, Plane, extent, first_hits, pictured
+
+__all__ = [
+    "CHART", "Chart", "ChartSettings", "Hits", "Laid", "Plane", "chart_number", "draw_charts", "extent", "find_planes",
+    "first_hits", "lay_planes", "pictured",
+]  # fmt: skip
 
 
 def chart_number(reference: str | None) -> int | None:

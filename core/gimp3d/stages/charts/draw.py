@@ -37,18 +37,14 @@ MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that l
 
 
 @dataclass(frozen=True)
-class Chart(Facing):
+class Chart(Facing, Laid):
     """A surface seen straight on, its object left out; arrays [H, W] of its camera."""
 
-    kind: str  # plane | relief
     photos: np.ndarray  # uint16, how many show it
     below: np.ndarray  # bool, known only from what the object's rough mask covers
     rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
-    agreement: float  # of the photos round the hole, see Textures
-    noise: float  # median distance of the views' drawn surfaces from it, scene units
     scatter: float  # relative z by which the views' drawn surfaces scatter about it
     tolerance: float  # the same, but never very small: within it a drawn surface is this one
-    reason: str
 
 
 def lay_planes(
@@ -60,12 +56,9 @@ def lay_planes(
 ) -> tuple[Laid, ...]:
     """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
     textures = Textures.make(witnesses)
-    laid = []
-    for plane in planes:
-        if (flat := _placed(plane, region, views, witnesses, settings.largest)) is not None:
-            surface = lay_surface(flat, region, views, witnesses, textures, settings)
-            laid.append(replace(surface, others=tuple(p for p in planes if plane.crosses(p))))
-    return tuple(laid)
+    flats = [_placed(plane, region, views, witnesses, settings.largest) for plane in planes]
+    laid = [lay_surface(flat, region, views, witnesses, textures, settings) for flat in flats if flat is not None]
+    return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
 
 
 def draw_charts(
@@ -121,22 +114,16 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
     hole = _without_islands((shown.hole & ~below) | rests, ((shown.photos < 2) & shown.there) | below)
     below &= ~hole
     return Chart(
-        laid.plane,
-        laid.camera,
-        laid.depth,
-        shown.there,
+        **vars(laid),
+        there=shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
         known=(shown.known | below) & ~hole & ~foreign,
         hole=hole,
-        kind=laid.kind,
         photos=np.where(below, shown.hiding, shown.photos),
         below=below,
         rests=rests,
-        agreement=laid.agreement,
-        noise=laid.noise,
         scatter=scatter,
         tolerance=tolerance,
-        reason=laid.reason,
     )
 
 

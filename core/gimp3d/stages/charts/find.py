@@ -57,17 +57,17 @@ class ChartSettings:
 
 
 @dataclass(frozen=True)
-class _Round:
-    """Surface that the views show round the object."""
+class Beside:
+    """Points of the solid surfaces that views show beside the object."""
 
     points: np.ndarray  # [N, 3]
     eyes: np.ndarray  # [N, 3] where the view stood that shows it
     weight: np.ndarray  # [N], how much it tells of what the object hid
 
-    def take(self, rows: np.ndarray) -> _Round:
-        return _Round(self.points[rows], self.eyes[rows], self.weight[rows])
+    def take(self, rows: np.ndarray) -> Beside:
+        return Beside(self.points[rows], self.eyes[rows], self.weight[rows])
 
-    def some(self, count: int) -> _Round:
+    def some(self, count: int) -> Beside:
         """At most so many, drawn by what they tell."""
         if len(self.points) <= count:
             return self
@@ -88,12 +88,9 @@ def surface_depth_beside(view: ViewMasks, witness: Witness) -> np.ndarray:
 
 
 def surface_beside(
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],
-    most: int,  # points, about
-    within: tuple[float, float] = (0.0, math.inf),  # px from the object
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] of the solid surfaces that views show beside the object, and where each view stands [N, 3]."""
+    views: Sequence[ViewMasks], witnesses: Sequence[Witness], most: int, within: tuple[float, float] = (0.0, math.inf)
+) -> Beside:
+    """About as many points as are asked for, all of the same weight, within so many px from the object."""
 
     def of(view: ViewMasks, witness: Witness) -> tuple[np.ndarray, np.ndarray]:
         far = cv2.distanceTransform((~witness.hidden).astype(np.uint8), cv2.DIST_L2, 5)
@@ -102,21 +99,20 @@ def surface_beside(
         points = surface_points(view.camera, depth, step=step)[2]
         return points, np.broadcast_to(view.camera.centre, points.shape)
 
-    points, eyes = zip(*parallel_map(lambda p: of(*p), zip(views, witnesses)))
-    return np.concatenate(points), np.concatenate(eyes)
+    points, eyes = (np.concatenate(p) for p in zip(*parallel_map(lambda p: of(*p), zip(views, witnesses))))
+    return Beside(points, eyes, np.ones(len(points)))
 
 
-def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> _Round:
-    points, eyes = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
-    outside = ~in_region(region, points)
-    points, eyes = points[outside], eyes[outside]
-    said = ask(witnesses, points, TOLERANCE)
+def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> Beside:
+    beside = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
+    beside = beside.take(~in_region(region, beside.points))
+    said = ask(witnesses, beside.points, TOLERANCE)
     share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
     near = share > HIDDEN
     # few views, or all from one place: what is beside the object is all that tells
     if len(views) < AGREEING or not near.any():
-        near, share = np.ones(len(points), bool), np.ones(len(points))
-    return _Round(points[near], eyes[near], share[near] ** 2)
+        return beside
+    return replace(beside, weight=share**2).take(near)
 
 
 def find_planes(
@@ -134,16 +130,13 @@ def find_planes(
     the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
     that could both be what some pixels show photos choose as well.
     """
-    diagonal = extent(region)
-    around = _surface_round(views, witnesses, region)
-    levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
-    textures = levels[-1]
-    cameras = np.array([v.camera.centre for v in views])
-    rng, left = np.random.default_rng(0), around
-    sought: list[tuple[Plane, _Round]] = []
-    while len(sought) < MOST:
+    diagonal, levels = extent(region), [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
+    textures, cameras = levels[-1], np.array([v.camera.centre for v in views])
+    left, rng = _surface_round(views, witnesses, region), np.random.default_rng(0)
+    least, sought = settings.least * left.weight.sum(), list[tuple[Plane, Beside]]()
+    for _ in range(MOST):
         candidate = largest_plane(left.points, left.weight, INLIER * diagonal, cameras, region, rng)
-        if candidate is None or left.weight[candidate[1]].sum() < settings.least * around.weight.sum():
+        if candidate is None or left.weight[candidate[1]].sum() < least:
             break
         plane, on = candidate
         sought.append((plane, left.take(on)))
@@ -171,7 +164,7 @@ def grid(half: float, count: int) -> np.ndarray:
     return np.array(np.meshgrid(side, side))
 
 
-def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
+def _bounds(plane: Plane, own: Beside, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
     """The planes that a plane ends at, and on which side of them its own points lie: 1 above, −1 below."""
     bounds = []
     for other in others:
@@ -187,7 +180,7 @@ class _Claim:
     """Pixels that seem to show one plane, and a rough guess of it."""
 
     plane: Plane
-    own: _Round
+    own: Beside
     bounds: list[tuple[Plane, int]]  # see _bounds
     half: float  # diagonals of the region
 
@@ -243,8 +236,7 @@ def _best_known(
     """Where photos agree better still: climbed from where other claims settled, of one surface that looked like two."""
     agreement = claim.agreement(textures)
     starts = [claim.pose_of(p) for p in known if p is not plane and not p.crosses(claim.plane)]
-    better = [start for start in _best_of(agreement, starts, 1) if agreement(start) > best]
-    found = [_climbed(agreement, start, FINE_STEP) for start in better]
+    found = [_climbed(agreement, s, FINE_STEP) for s in _best_of(agreement, starts, 1) if agreement(s) > best]
     return (found[0][0], claim.at(found[0][1])) if found else (best, plane)
 
 
@@ -273,9 +265,9 @@ class Laid(Surface):
 
     kind: str  # plane | relief
     agreement: float  # of photos on it, see Textures
+    noise: float  # median distance of the views' drawn surfaces from the plane, scene units
+    others: tuple[Plane, ...]  # planes that it may meet
     reason: str
-    noise: float = np.nan  # median distance of the views' drawn surfaces from the plane, scene units
-    others: tuple[Plane, ...] = ()  # planes that it may meet
 
 
 def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float) -> Surface:
@@ -312,7 +304,7 @@ def lay_surface(
     """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
 
     def at(offset: np.ndarray | float, kind: str) -> Laid:
-        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, "")
+        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, np.nan, (), "")
         agreement = textures.agreement(laid.points().reshape(-1, 3))
         return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
 

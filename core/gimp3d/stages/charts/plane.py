@@ -158,12 +158,8 @@ def pictured(surfaces: Sequence[Facing], hits: Hits) -> tuple[np.ndarray, np.nda
     return image, known, hole
 
 
-def first_hits(
-    surfaces: Sequence[Facing],
-    camera: Camera,
-    pixels: np.ndarray,  # [H, W] bool, the rays that are asked for
-) -> Hits:
-    """Where rays meet the first of the surfaces: in a room seen from inside, that is what shows."""
+def first_hits(surfaces: Sequence[Facing], camera: Camera, pixels: np.ndarray) -> Hits:
+    """Where the rays of pixels [H, W] bool meet the first of the surfaces: seen from inside a room, that is shown."""
     shape = pixels.shape
     hits = Hits(np.full(shape, -1, np.int8), np.zeros(shape, np.float32), *np.zeros((2, *shape), np.int32))
     rows, cols = np.nonzero(pixels)

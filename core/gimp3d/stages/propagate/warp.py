@@ -138,12 +138,8 @@ class Warp:
         """[h, w] bool: pixels whose surface the reference shows."""
         return ~np.isnan(self.u)
 
-    def lookup(
-        self,
-        picture: np.ndarray,  # [H, W, ...] of the reference
-        where: np.ndarray,  # [h, w] bool, reached
-    ) -> np.ndarray:
-        """The picture's values at those pixels, [N, ...]."""
+    def lookup(self, picture: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """The values [N, ...] of a picture [H, W, ...] of the reference at pixels `where` [h, w] bool, all reached."""
         return picture[self.v[where].astype(int), self.u[where].astype(int)]
 
 
