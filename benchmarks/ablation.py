@@ -84,11 +84,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
     ),
     "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
-    "textures may not be misplaced": (("gimp3d.stages.charts.draw:MISPLACED", 0.0),),
-    "mixed pixels at the outline stay": (
-        ("gimp3d.stages.charts.draw:_mixed", lambda _, hole, __: np.zeros_like(hole)),
-    ),
-    "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
+    "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
+    "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
+    "islands in a chart's hole stay": (("gimp3d.stages.charts:_without_islands", lambda hole, _: hole),),
     # what stays round it
     "what stays learns nothing": (("gimp3d.steps.relearning:SHOWN", math.inf),),
     "charts teach what stays nothing": (("gimp3d.steps.relearning:WRONG", math.inf),),

@@ -11,7 +11,7 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..geometry import dilated
-from .charts.draw import shown_there, usual_spread
+from .charts import shown_there, usual_spread
 from .charts.find import flat_surface, lay_surface, pixel_size, surface_beside
 from .charts.plane import Facing, Plane, extent, largest_plane
 from .masks import ViewMasks

@@ -306,15 +306,11 @@ def _with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView
     return replace(painted, image=completed.image[part], rules=rules)
 
 
-def redrawn(
-    picture: np.ndarray,  # [H, W, 3] uint8
-    filled: Gaussians,
-    view: ViewMasks,
-    touched: Window,  # where the last new Gaussians may be
-) -> np.ndarray:
-    """A painted view, with the filled scene where the removal left a gap that was never to be filled.
+def redrawn(picture: np.ndarray, filled: Gaussians, view: ViewMasks, touched: Window) -> np.ndarray:
+    """A painted view [H, W, 3] uint8, with the filled scene where the removal left a gap that was never to be filled.
 
-    Beside what is in front, its soft edge is no target, but the emptied scene shows through it.
+    Beside what is in front, its soft edge is no target, but the emptied scene shows through it. The last new Gaussians
+    may be where the view is `touched`.
     """
     gap = view.silhouette & ~view.target & (view.alpha_after < OPAQUE) & window_mask(touched, view.camera)
     if not gap.any():
@@ -322,14 +318,9 @@ def redrawn(
     return np.where(gap[..., None], render_bytes(filled, view.camera, pixels=gap), picture)
 
 
-def still_open(
-    view: ViewMasks,
-    filled: Gaussians,
-    added: int,
-    rules: np.ndarray,
-    touched: np.ndarray,  # [H, W] bool, where the last new Gaussians may be: elsewhere the view is as it was
-) -> ViewMasks:
-    """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover.
+def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray, touched: np.ndarray) -> ViewMasks:
+    """A view's masks once the new Gaussians (the last `added` rows) are there: T is what they do not cover. Where no
+    last one may be, not `touched` [H, W] bool, the view is as it was.
 
     A pixel that a splat's edge covers but that got no colour stays open, or the next fill would continue its old one.
     What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is

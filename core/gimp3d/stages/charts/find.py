@@ -122,13 +122,12 @@ def find_planes(
     settings: ChartSettings = ChartSettings(),
     settled: bool = True,  # by photos; else as splats draw them
 ) -> tuple[Plane, ...]:
-    """The planes nearest to the surfaces that run into what the object hid.
+    """The planes nearest to the surfaces that run into what the object hid, sought among points of surface round it.
 
-    Planes are sought among the points of surface round the object, each counting by the square of the share of views
-    in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
-    photos' textures agree best, since the depths of rough splats do not tell: at the pixels that led to it, and round
-    the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
-    that could both be what some pixels show photos choose as well.
+    Each counts by the square of the share of views in which the object hides it: what is hidden often lies near what is
+    hidden always. Planes are then settled where photos' textures agree best, as rough splats' depths do not tell: at
+    the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
+    painted on those. Of two planes that could both be what some pixels show photos choose as well.
     """
     diagonal, levels = extent(region), [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
     textures, cameras = levels[-1], np.array([v.camera.centre for v in views])
@@ -218,8 +217,7 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
     """
     sweep, tilts = np.linspace(-1, 1, SWEEP) * SEARCH, (-TILT, 0.0, TILT)
     anywhere = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
-    best, at = 0.0, np.zeros(3)
-    reached: list[np.ndarray] = []
+    best, reached = 0.0, list[np.ndarray]()
     for shrink, textures in zip(LEVELS, levels):
         finest = shrink == LEVELS[-1]
         agreement = claim.agreement(textures, shrink)
@@ -227,7 +225,7 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
         starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
         reached = [at]
-    return best, claim.at(at) if best > 0 else claim.plane
+    return best, claim.at(reached[0]) if best > 0 else claim.plane
 
 
 def _best_known(
