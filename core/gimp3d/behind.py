@@ -14,9 +14,18 @@ from .run import Run
 from .stages.charts import Chart
 from .stages.exposure import exposures_of
 from .stages.masks import Masks
-from .steps.light import NOT_LIT, Found, Relit, find_light, undo_light, with_contact
-from .steps.relearning import relearn
-from .steps.surfaces import Charted, chart_surfaces, find_surfaces
+from .steps.behind import (
+    NOT_LIT,
+    Charted,
+    Found,
+    Relit,
+    chart_surfaces,
+    find_light,
+    find_surfaces,
+    relearn,
+    undo_light,
+    with_contact,
+)
 from .view_state import ViewState
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks

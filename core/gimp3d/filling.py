@@ -17,6 +17,7 @@ from .stages.charts import Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
 from .stages.refine import observed, refine_gaussians
+from .steps.behind import take_painted_colours
 from .steps.references import (
     Completed,
     Turn,
@@ -36,7 +37,6 @@ from .steps.references import (
     texels_to_fill,
     with_answers,
 )
-from .steps.relearning import take_painted_colours
 from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open

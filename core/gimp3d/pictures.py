@@ -18,7 +18,7 @@ from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation
 from .stages.view_refinement import ViewRefinement
-from .steps.light import Relit
+from .steps.behind import Relit
 from .steps.references import Completed
 from .view_state import ViewState
 

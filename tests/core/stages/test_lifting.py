@@ -17,8 +17,7 @@ from gimp3d.stages.lifting import Arriving, _lifted, light_in
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
-from gimp3d.steps.light import find_light
-from gimp3d.steps.surfaces import find_surfaces
+from gimp3d.steps.behind import find_light, find_surfaces
 from gimp3d.view_state import ViewState
 
 

@@ -22,8 +22,6 @@ from .blend import blend_band, to_bytes
 from .paper import Sampler, Sources, blend_rim, sampler
 from .warp import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint, warp_reference
 
-TRANSFERS = ("warp", "sample")
-BLENDS = ("band", "rim")
 SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area
 LEAST_REACH = 16  # px of that
 BAND = 1 / 8  # of that: the strip round the hole that the blend is fitted to most
@@ -48,17 +46,16 @@ def propagate(
     """Paint the hole of every view. Painted views are never sources for others: order is irrelevant.
 
     `sources` is the mapping field, rows and columns [H, W] int32 of each of the reference's target pixels' source, -1 =
-    none: only the paper's sampling asks for it.
-
-    As many views are in memory as threads work on them; what is kept of each is the part round its hole.
+    none: only the paper's sampling asks for it. As many views are in memory as threads work on them, and of each the
+    part round its hole is kept.
 
     Raises
     ------
     BadInput
         If the transfer or the blend is unknown.
     """
-    for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
-        if value not in known:
+    for name, known in (("transfer", ("warp", "sample")), ("blend", ("band", "rim"))):
+        if (value := getattr(settings, name)) not in known:
             raise BadInput(f"propagate: unknown {name} {value!r}; use {', '.join(known)}")
     sample = sampler(reference, sources, views, settings) if sources and settings.transfer == "sample" else None
     done = itertools.count(1)
@@ -93,7 +90,8 @@ def _painted(
     photo = ~near.silhouette & same & ~hole & (distance <= reach)
     depth = np.ascontiguousarray(near.depth_new, np.float32)
     warp = warp_reference(reference, near.camera, depth, hole | photo)
-    painted, photo = hole & warp.reached, photo & warp.reached
+    reached = ~np.isnan(warp.u)
+    painted, photo = hole & reached, photo & reached
     photo[photo] = warp.lookup(reference.source | reference.target, photo)
     rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
     rules[painted] = Rule.REFERENCE if sample else Rule.OWN_PIXELS

@@ -93,10 +93,9 @@ def _sample(
     found = np.append(source_rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
     rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
     rows, cols = np.nonzero(reached)
-    places = rows, cols, warp.u, warp.v
     taken = mapped.index, *sources, source_rules, *_borrowed(mapped, view, source_rules == 0, lent)
-    pictures = mapped.picture, picture_of(view)
-    run_ranges(_sample_range, len(rows), *places, *taken, *pictures, SAME_DEPTH, RADIUS, warp.colours, rules)
+    given = rows, cols, warp.u, warp.v, *taken, mapped.picture, picture_of(view), SAME_DEPTH, RADIUS
+    run_ranges(_sample_range, len(rows), *given, warp.colours, rules)
 
 
 def _borrowed(
@@ -104,10 +103,8 @@ def _borrowed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """[M, 3] colours of wanted sources in the nearest view that shows them, at this exposure; [M] bool: there."""
     colours, has = np.zeros((len(wanted), 3), np.float32), np.zeros(len(wanted), bool)
-    others = sorted(
-        (x for x in lent if x.camera.id != view.camera.id),
-        key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id),
-    )
+    others = [x for x in lent if x.camera.id != view.camera.id]
+    others.sort(key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id))
     gain = _lend(mapped, view).gain if others else np.ones(3)
     for other in others:
         new = other.seen & wanted & ~has
@@ -130,11 +127,10 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
 def blend_rim(
     base: np.ndarray, raw: np.ndarray, painted: np.ndarray, no_photo: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32, its rim as in the view `base`
-    [H, W, 3] uint8. `painted` [H, W] bool is where the fill is, `no_photo` [H, W] bool what bounds none: the rest of
-    the hole, renderings of the emptied scene; `depth` [H, W] is z of the new scene.
-
-    The rim counts only where no depth seam parts it from the fill. Parts without a rim keep their own colours.
+    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32 where it is `painted` [H, W]
+    bool, its rim as in the view `base` [H, W, 3] uint8, but for `no_photo` [H, W] bool: the rest of the hole, drawings
+    of the emptied scene. The rim counts only where no seam of `depth`, [H, W] z of the new scene, parts it from the
+    fill. Parts without a rim keep their own colours.
     """
     if not painted.any():
         return base.copy()

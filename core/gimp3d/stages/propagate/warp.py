@@ -117,10 +117,7 @@ class Picture(NamedTuple):
 
 def picture_of(view: ViewToPaint | Reference) -> Picture:
     """The view with the object, or the completed reference."""
-    if isinstance(view, Reference):
-        depth, usable = view.depth, view.source
-    else:
-        depth, usable = view.depth_before, ~view.silhouette
+    depth, usable = (view.depth, view.source) if isinstance(view, Reference) else (view.depth_before, ~view.silhouette)
     arrays = np.asarray(depth, np.float32), view.image, usable
     return Picture(pack_camera(view.camera), *(np.ascontiguousarray(a) for a in arrays))
 
@@ -132,11 +129,6 @@ class Warp:
     colours: np.ndarray  # [h, w, 3] float32
     u: np.ndarray  # [h, w] where it lies in the reference; NaN: the reference does not show it, or nobody asked
     v: np.ndarray
-
-    @property
-    def reached(self) -> np.ndarray:
-        """[h, w] bool: pixels whose surface the reference shows."""
-        return ~np.isnan(self.u)
 
     def lookup(self, picture: np.ndarray, where: np.ndarray) -> np.ndarray:
         """The values [N, ...] of a picture [H, W, ...] of the reference at pixels `where` [h, w] bool, all reached."""
