@@ -72,29 +72,27 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
     "a tenth of it is": (("clearing.observed", 0.1),),
     "what a box cuts out of a surface counts as the object": (
-        ("gimp3d.steps.surfaces:sunk_rows", lambda *_: np.zeros(0, int)),
+        ("gimp3d.steps.behind:sunk_rows", lambda *_: np.zeros(0, int)),
     ),
     "a surface need not be agreed on to get back what a box cut out": (
-        ("gimp3d.steps.surfaces:with_surface", Around(_known_if_shown)),
+        ("gimp3d.steps.behind:with_surface", Around(_known_if_shown)),
     ),
     "photos of rests vouch for them, and are not filled": (
-        ("gimp3d.steps.surfaces:hiding_rests", lambda witnesses, _: witnesses),
+        ("gimp3d.steps.behind:hiding_rests", lambda witnesses, _: witnesses),
     ),
     "what stands on holes stays if a photo shows it": (
         ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
     ),
     "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
-    "textures may not be misplaced": (("gimp3d.stages.charts.draw:MISPLACED", 0.0),),
-    "mixed pixels at the outline stay": (
-        ("gimp3d.stages.charts.draw:_mixed", lambda _, hole, __: np.zeros_like(hole)),
-    ),
-    "islands in a chart's hole stay": (("gimp3d.stages.charts.draw:_without_islands", lambda hole, _: hole),),
+    "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
+    "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
+    "islands in a chart's hole stay": (("gimp3d.stages.charts:_without_islands", lambda hole, _: hole),),
     # what stays round it
-    "what stays learns nothing": (("gimp3d.steps.relearning:SHOWN", math.inf),),
-    "charts teach what stays nothing": (("gimp3d.steps.relearning:WRONG", math.inf),),
-    "shapes of what stays learn too": (("gimp3d.steps.relearning:LEARNED", ARRAYS),),
-    "what draws other places more learns too": (("gimp3d.steps.relearning:SHARE", 0.0),),
-    "what is drawn before new Gaussians keeps its colours": (("gimp3d.steps.relearning:VISIBLE", math.inf),),
+    "what stays learns nothing": (("gimp3d.steps.behind:SHOWN", math.inf),),
+    "charts teach what stays nothing": (("gimp3d.steps.behind:WRONG", math.inf),),
+    "shapes of what stays learn too": (("gimp3d.steps.behind:LEARNED", ARRAYS),),
+    "what draws other places more learns too": (("gimp3d.steps.behind:SHARE", 0.0),),
+    "what is drawn before new Gaussians keeps its colours": (("gimp3d.steps.behind:VISIBLE", math.inf),),
     # into the other views
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
@@ -136,7 +134,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "pixels beside the object are lifted": (("gimp3d.stages.lifting:MIXED", 0.3),),
     "lifted ground may be brighter than lit ground": (("gimp3d.stages.lifting:BRIGHTER", math.inf),),
     "the darkest are lifted": (("gimp3d.stages.lifting:DARKEST", 0.05),),
-    "the support is what photos agree on best": (("gimp3d.steps.light:support_first", lambda planes, _: planes),),
+    "the support is what photos agree on best": (("gimp3d.steps.behind:support_first", lambda planes, _: planes),),
     "walls hide no sky": (
         ("gimp3d.stages.light_search:_open_sky", Around(lambda sky: lambda _: sky(np.zeros((0, 3))))),
     ),

@@ -14,9 +14,18 @@ from .run import Run
 from .stages.charts import Chart
 from .stages.exposure import exposures_of
 from .stages.masks import Masks
-from .steps.light import NOT_LIT, Found, Relit, find_light, undo_light, with_contact
-from .steps.relearning import relearn
-from .steps.surfaces import Charted, chart_surfaces, find_surfaces
+from .steps.behind import (
+    NOT_LIT,
+    Charted,
+    Found,
+    Relit,
+    chart_surfaces,
+    find_light,
+    find_surfaces,
+    relearn,
+    undo_light,
+    with_contact,
+)
 from .view_state import ViewState
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
@@ -62,25 +71,24 @@ def look_behind(
     surfaces = run("surfaces", find_surfaces, *inputs)
     masks = replace(masks, selection=surfaces.selection)
 
-    def in_light(found: Found | None, suffix: str = "") -> tuple[Relit, Charted]:
+    def in_light(found: Found, suffix: str = "") -> tuple[Relit, Charted]:
         """What the object does to the light undone, and the charts as they are then."""
-        light = None
-        if found is not None and found.anything:
-            light = run(f"lift{suffix}", undo_light, scene, masks, surfaces, views, found)
-        lit = NOT_LIT if found is None else Relit.of(found, light)
+        light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
+        lit = Relit(found, light)
         bounded = surfaces if light is None else surfaces.with_marked(light.dark)
-        inputs = lit.scene(scene), region, masks, bounded, lit.views(views), settings
+        inputs = lit.scene(scene), region, bounded, lit.views(views), settings
         return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
 
-    found = None
+    found = NOT_LIT.found
     if settings.shadow != "off":
-        found = run("light", find_light, scene, region, masks, surfaces, views, shadow_masks, settings)
-        if found.shadow is None and settings.shadow == "mask":
-            run.warnings.append(found.why_shadow)
+        found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
+        if isinstance(found.shadow, str) and settings.shadow == "mask":
+            run.warnings.append(found.shadow)
     lit, charted = in_light(found)
-    if found is not None and found.shadow is None and settings.shadow == "auto":
+    if isinstance(found.shadow, str) and settings.shadow == "auto":
         found = run("contact", with_contact, found, charted.charts)
-        lit, charted = in_light(found, " 2") if found.shadow is not None else (Relit.of(found, lit.lifted), charted)
+        again = not isinstance(found.shadow, str)
+        lit, charted = in_light(found, " 2") if again else (Relit(found, lit.lifted), charted)
     if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
         surfaces = run("surfaces 2", find_surfaces, *inputs, False)
         masks = replace(masks, selection=surfaces.selection)

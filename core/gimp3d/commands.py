@@ -38,8 +38,8 @@ from .run import Run
 from .settings import job_settings, shadow_of
 from .stages.charts import Chart, chart_number
 from .stages.masks import MaskSettings, find_masks
-from .steps.completion import charts_to_paint
-from .steps.light import NOT_LIT
+from .steps.behind import NOT_LIT
+from .steps.references import charts_to_paint
 from .store import SharedStages, StageStore
 from .summary import summary_of, variant_facts
 from .view_state import ViewState

@@ -17,28 +17,26 @@ from .stages.charts import Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
 from .stages.refine import observed, refine_gaussians
-from .steps.asking import ask_to_refine, with_answers
-from .steps.carrying import (
-    as_reference,
+from .steps.behind import take_painted_colours
+from .steps.references import (
+    Completed,
+    Turn,
+    after_reference,
+    ask_to_refine,
+    carried_over,
+    complete_view_depth,
+    emptied,
+    left_to_charts,
     map_reference,
+    paint_chart,
+    paint_view,
     paint_views,
     seed_surface,
     settle_seeds,
     snapped,
-    with_own_picture,
-)
-from .steps.completion import (
-    Completed,
-    Turn,
-    carried_over,
-    complete_view_depth,
-    left_to_charts,
-    paint_chart,
-    paint_view,
     texels_to_fill,
+    with_answers,
 )
-from .steps.coverage import after_reference, emptied
-from .steps.relearning import take_painted_colours
 from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
@@ -99,7 +97,7 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
     name = f"appearance{suffix}"
     appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    return Completed(chart.camera, appearance, chart.depth, target, ~target & ~hole & chart.known, (chart,))
+    return Completed(chart.camera, appearance.image, chart.depth, target, ~target & ~hole & chart.known, (chart,))
 
 
 def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
@@ -125,7 +123,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     run.warnings += appearance.warnings
     run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
     source = ~view.left.target & ~view.left.silhouette & (depth > 0)
-    return Completed(view.camera, appearance, depth, view.left.target, source, charts if rough else ())
+    return Completed(view.camera, appearance.image, depth, view.left.target, source, charts if rough else ())
 
 
 def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
@@ -143,11 +141,10 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
     new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
-    shown = [with_own_picture(p, completed) for p in painting.views]
     added = new if filling.added is None else filling.added.extended(new)
-    reference, filled = as_reference(completed), filling.kept.extended(added)
-    views = after_reference(views, shown, reference, filled, new, len(added))
-    return replace(filling, views=views, added=added, done=(*filling.done, reference))
+    filled = filling.kept.extended(added)
+    views = after_reference(views, painting.views, completed, filled, new, len(added))
+    return replace(filling, views=views, added=added, done=(*filling.done, completed))
 
 
 def ask_for_refinement(run: Run, filling: Filling) -> Filling:

@@ -18,8 +18,8 @@ from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation
 from .stages.view_refinement import ViewRefinement
-from .steps.completion import Completed
-from .steps.light import Relit
+from .steps.behind import Relit
+from .steps.references import Completed
 from .view_state import ViewState
 
 T = TypeVar("T")
@@ -84,7 +84,7 @@ def of_depth(
 
 
 def of_reference(completed: Completed, field: MappingField | None) -> list[Picture]:
-    image, name = completed.appearance.image, completed.camera.id
+    image, name = completed.image, completed.camera.id
     shown = [Picture("appearance", f"The reference without the object, {name}", image, (completed.target,))]
     if field is not None:
         shown.append(Picture("mapping", f"Mapping field of {name}", image, (field.rows, field.cols)))

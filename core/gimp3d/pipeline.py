@@ -25,8 +25,8 @@ from .run import Observer, Run, Store, unobserved
 from .stages.masks import Masks, find_masks
 from .stages.propagate import Reference
 from .stages.verdict import Verdict, judge
-from .steps.completion import charts_to_paint, complete_view_depth, turns_of
-from .steps.light import NOT_LIT, Relit
+from .steps.behind import NOT_LIT, Relit
+from .steps.references import charts_to_paint, complete_view_depth, turns_of
 from .view_state import ViewState, open_pixels
 
 __all__ = [

@@ -57,7 +57,7 @@ class RemovalResult:
     views: int = 0
     painted: dict[str, np.ndarray] = field(default_factory=dict)  # ID → I_t* [H, W, 3] uint8
     pictures: tuple[Picture, ...] = ()
-    charts: tuple[Chart, ...] = ()  # as completed; see steps.completion.charts_to_paint
+    charts: tuple[Chart, ...] = ()  # as completed; see steps.references.charts_to_paint
     references: tuple[ReferenceChoice, ...] = ()  # in the order in which they were completed
     warnings: tuple[str, ...] = ()
     selection: dict[str, int] = field(default_factory=dict)  # how many rows have which masks' Fate

@@ -14,7 +14,7 @@ from ..gaussians import Gaussians
 from ..geometry import dilated, framed, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
-from .charts import Chart, Hits, LaidPlane, extent, first_hits
+from .charts import Chart, Hits, Laid, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
 from .witness import AGREEING, Witness, total_over
@@ -82,13 +82,13 @@ def vouching(
     return np.where(rows, photos, 0), np.where(rows, hidden, 0)
 
 
-def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[LaidPlane]) -> np.ndarray:
+def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[Laid]) -> np.ndarray:
     """[M] rows taken for the object that do not stand before a surface: splats of floors mostly lie a little below."""
     rows = np.flatnonzero(np.isin(selection.fates, (Fate.REMOVED_INSIDE, Fate.REMOVED_STRADDLING)))
     sunk = np.zeros(len(rows), bool)
     for one in laid:
         index, *at, z = framed(one.camera, scene.means[rows].astype(np.float64))
-        sunk[index] |= z > one.surface.depth[tuple(at)]
+        sunk[index] |= z > one.depth[tuple(at)]
     return rows[sunk]
 
 

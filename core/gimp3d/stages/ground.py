@@ -11,11 +11,9 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..geometry import dilated
-from .charts.draw import shown_there, usual_spread
-from .charts.find import surface_beside
-from .charts.hits import Facing
-from .charts.plane import Plane, extent, largest_plane
-from .charts.surface import facing_camera, lay_surface, pixel_size
+from .charts import shown_there, usual_spread
+from .charts.find import flat_surface, lay_surface, pixel_size, surface_beside
+from .charts.plane import Facing, Plane, extent, largest_plane
 from .masks import ViewMasks
 from .mosaic import mosaic
 from .witness import Says, Textures, Witness, ask
@@ -49,7 +47,7 @@ def _walls(
 ) -> list[Plane]:
     """Planes beside the object, which it hides nowhere, that hold most of what stands round it."""
     diagonal = extent(region)
-    points, _ = surface_beside(views, witnesses, WALL_POINTS)
+    points = surface_beside(views, witnesses, WALL_POINTS).points
     points = points[(np.abs(points - planes[0].origin) < REACH * diagonal).all(1)]
     for plane in planes:
         points = points[plane.local(points)[:, 2] > WALL_INLIER * diagonal]
@@ -71,22 +69,23 @@ def _look_at(
 ) -> Ground:
     diagonal = extent(region)
     texel = diagonal / DENSITY
-    camera, away = facing_camera(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
+    flat = flat_surface(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
     beside = max(BESIDE, math.ceil(BLURRED * pixel_size(plane.origin, plane.normal, views) / texel))
     views, witnesses = zip(*parallel_map(lambda p: _shrunk(*p, plane.origin, texel), list(zip(views, witnesses))))
     textures = Textures.make(witnesses)
-    surface = lay_surface(camera, away, plane, region, views, witnesses, textures, enough=ENOUGH)
-    said = ask(witnesses, surface.texels, ROUGH).reshape(-1, camera.height, camera.width)
-    image, spread, _ = mosaic(surface.points, plane.normal, witnesses, said)
+    surface = lay_surface(flat, region, views, witnesses, textures, enough=ENOUGH)
+    points = surface.points()
+    said = ask(witnesses, points.reshape(-1, 3), ROUGH).reshape(-1, *flat.depth.shape)
+    image, spread, _ = mosaic(points, plane.normal, witnesses, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
     there = np.ones(photos.shape, bool)
     for other in planes:
         if plane.crosses(other):
-            there &= other.local(surface.texels)[:, 2].reshape(there.shape) > 0
+            there &= other.local(points.reshape(-1, 3))[:, 2].reshape(there.shape) > 0
     known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = dilated((photos <= 1) & (hidden > 0), beside)
-    return Ground(plane, camera, surface.depth, there, image, known & ~hole, hole)
+    return Ground(plane, flat.camera, surface.depth, there, image, known & ~hole, hole)
 
 
 def _shrunk(view: ViewMasks, witness: Witness, place: np.ndarray, texel: float) -> tuple[ViewMasks, Witness]:

@@ -16,7 +16,7 @@ from ..raster import PixelRegion, label_weights, pixel_region
 from ..sh import sh_basis
 from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
-from .charts.hits import Hits, first_hits, pictured
+from .charts.plane import Hits, first_hits, pictured
 from .ground import Ground
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
@@ -63,8 +63,8 @@ def lift(
     scene: Gaussians,
     removed: np.ndarray,  # [N] bool, the object
     witnesses: Sequence[Witness],
-    reflection: Reflection | None,
-    shadow: Shadow | None,  # one of them at least
+    reflection: Reflection | str | None,  # words, or None: there is none
+    shadow: Shadow | str | None,  # one of them at least
 ) -> Lifted:
     """Subtract the reflection's light, then divide by the share of light that arrives: in photos, and in the Gaussians
     that they show there.
@@ -73,10 +73,10 @@ def lift(
     all of their SH are corrected.
     """
     steps: list[tuple[float, Callable[[Sequence[Witness]], list[Undone]], int, str]] = []
-    if reflection is not None:
+    if isinstance(reflection, Reflection):
         bare = partial(bare_photos, reflection)
         steps.append((reflection.confidence, bare, scene.sh_degree, "show its reflection"))
-    if shadow is not None:
+    if isinstance(shadow, Shadow):
         steps.append((shadow.confidence, partial(lifted_photos, shadow), 0, "lie in its shadow"))
     before, sh, rows, words = tuple(w.photo for w in witnesses), scene.sh.copy(), np.zeros(0, int), []
     shaded = tuple(np.zeros_like(w.hidden) for w in witnesses)

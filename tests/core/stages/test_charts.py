@@ -14,7 +14,8 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
-from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw, extent, find, find_planes, first_hits
+from gimp3d.stages import charts as stage
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
@@ -211,7 +212,7 @@ def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(fl
 
 def test_a_claim_s_pose_leads_to_the_plane() -> None:
     plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION)
-    claim = find._Claim(plane, find._Round(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
+    claim = find._Claim(plane, find.Beside(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
     other = plane.tilted(0.1, 0.2, -0.1)
     x, y = np.random.default_rng(3).normal(size=(2, 20))
     reached = claim.at(claim.pose_of(other))
@@ -303,13 +304,13 @@ def test_what_seems_to_be_floor_amid_the_hole_is_part_of_it(floor_room: Room, mo
     floor = Plane.make(np.zeros(3), UP, REGION)
     taken = []
 
-    def told(shown: draw._Shown, *_: np.ndarray) -> tuple[np.ndarray, ...]:
+    def told(shown: stage._Shown, *_: np.ndarray) -> tuple[np.ndarray, ...]:
         inner = cv2.erode(shown.hole.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         right = shown.hole & (np.arange(shown.hole.shape[1]) > np.median(np.nonzero(shown.hole)[1]))
         taken.append(right if taken else inner)
         return taken[-1].copy(), np.zeros_like(inner), np.zeros_like(inner)
 
-    monkeypatch.setattr(draw, "_told_by_colours", told)
+    monkeypatch.setattr(stage, "_told_by_colours", told)
     amid, beside = (charts_of([floor], floor_room.views, floor_room.witnesses)[0] for _ in range(2))
     assert taken[0].sum() > 100 and amid.hole[taken[0]].all() and not amid.below.any()
     assert taken[1].sum() > 100 and beside.below[taken[1]].all() and not beside.hole[taken[1]].any()
@@ -340,8 +341,8 @@ def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
     beside = [replace(w, photo=np.roll(w.photo, k % 3 - 1, 1)) for k, w in enumerate(loud.witnesses)]
     plane = Plane.make(np.zeros(3), UP, REGION)
     known = []
-    for share in (draw.MISPLACED, 0):
-        monkeypatch.setattr(draw, "MISPLACED", share)
+    for share in (stage.MISPLACED, 0):
+        monkeypatch.setattr(stage, "MISPLACED", share)
         (chart,) = charts_of([plane], loud.views, beside)
         stripes = (texels(chart)[:, 0] > 0.4).reshape(chart.hole.shape) & chart.there & ~chart.hole & (chart.photos > 1)
         known.append(chart.known[stripes].mean())
@@ -416,9 +417,8 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     axes = pose[:3, :3]
     plane = Plane(offset * normal, axes[0], axes[1], normal)
     there = np.ones((h, w), bool)
-    return Chart(
-        plane, camera, depth, there, grey, no, no, "plane", no.astype(np.uint16), no, no, 1.0, 0.0, 0.0, 0.01, ""
-    )
+    laid, shown = (plane, camera, depth, "plane", 1.0, 0.0, (), ""), (there, grey, no, no)
+    return Chart(*laid, *shown, no.astype(np.uint16), no, no, scatter=0.0, tolerance=0.01)
 
 
 def rays_of(camera: Camera) -> np.ndarray:
@@ -537,8 +537,8 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     known[disputed] = False
     colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
     image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
-    shown = draw._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no)
-    _, rests, foreign = draw._told_by_colours(shown, image[hole], no, no)
+    shown = stage._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no)
+    _, rests, foreign = stage._told_by_colours(shown, image[hole], no, no)
     assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
     assert foreign[disputed].all() and not foreign[known].any()
     assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed
@@ -566,7 +566,7 @@ def test_mixed_pixels_beside_the_object_are_unlike_all_of_the_surface_near_by(gr
 
     def mixed(photos: int, hiding: int) -> np.ndarray:
         shown, hidden = (np.where(hole, 0, n).astype(np.uint16) for n in (photos, hiding))
-        return draw._mixed(draw._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, ~no), hole, beside)
+        return stage._mixed(stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, ~no), hole, beside)
 
     found = mixed(2, 5)
     assert found[dashes].all() and not found[spot].any() if grain == 1 else found[dashes].mean() < 0.2
@@ -580,8 +580,8 @@ def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:
     said[:, 20:40, 30:50] = Says.HIDDEN
     edge = said.copy()
     said[:, 24:36, 20:30] = Says.THROUGH
-    there = draw.shown_there(said)
+    there = stage.shown_there(said)
     assert there[20:40, 34:50].all() and not there[28, 24]
     edge[:, :, 40:][edge[:, :, 40:] == Says.SEEN] = Says.THROUGH
-    there = draw.shown_there(edge)
+    there = stage.shown_there(edge)
     assert there[20:40, 30:37].all() and not there[20:40, 44:].any()

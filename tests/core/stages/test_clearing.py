@@ -29,7 +29,7 @@ from gimp3d.stages.exposure import Exposure
 from gimp3d.stages.masks import Masks, ViewMasks
 from gimp3d.stages.selection import Fate, Selection
 from gimp3d.stages.witness import Says, Witness, ask
-from gimp3d.steps.surfaces import find_surfaces
+from gimp3d.steps.behind import find_surfaces
 from gimp3d.view_state import ViewState
 
 UP = np.array([0.0, 0, 1])

@@ -35,8 +35,8 @@ def chart_of(paint: Painted, taken: Callable[[np.ndarray], np.ndarray] = np.zero
     no, photos = np.zeros_like(hole), np.where(hole, 0, 9).astype(np.uint16)
     depth, there = np.full(hole.shape, 5, np.float32), np.ones_like(hole)
     return Chart(
-        plane, camera, depth, there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole,
-        "plane", photos, no, no, 1.0, 0.0, 0.0, 0.01, "",
+        plane, camera, depth, "plane", 1.0, 0.0, (), "",
+        there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole, photos, no, no, 0.0, 0.01,
     )  # fmt: skip
 
 

@@ -18,8 +18,7 @@ from gimp3d.stages.lifting import Arriving, _lifted, light_in, recoloured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
-from gimp3d.steps.light import find_light
-from gimp3d.steps.surfaces import find_surfaces
+from gimp3d.steps.behind import find_light, find_surfaces
 from gimp3d.view_state import ViewState
 
 
@@ -32,8 +31,8 @@ def prepared() -> tuple[list[Witness], Shadow]:
     exposures = exposures_of(lit.gaussians.take(~masks.removed), masks.views, photos)
     views = [ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views)]
     surfaces = find_surfaces(lit.gaussians, lit.region, masks, views, settings)
-    found = find_light(lit.gaussians, lit.region, masks, surfaces, views, {}, settings)
-    assert found.shadow is not None
+    found = find_light(lit.gaussians, lit.region, surfaces, views, {}, settings)
+    assert not isinstance(found.shadow, str)
     return surfaces.witnesses(views), found.shadow
 
 

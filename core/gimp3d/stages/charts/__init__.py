@@ -5,23 +5,310 @@ A chart's picture is made of all photos with the object left out; what no photo 
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from .draw import Chart as Chart
-from .draw import LaidPlane as LaidPlane
-from .draw import draw_charts as draw_charts
-from .draw import lay_planes as lay_planes
-from .find import ChartSettings as ChartSettings
+import cv2
+import numpy as np
+import scipy.ndimage
+
+from ...box import Region, in_region
+from ...compute.threads import parallel_map
+from ...geometry import dilated, framed, sees
+from ...solvers.kriging import carried
+from ..footprint import GRAIN, shows_object
+from ..masks import ViewMasks
+from ..mosaic import mosaic
+from ..witness import Says, Textures, Witness, ask
+from .find import CHART as CHART
+from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_size
 from .find import find_planes as find_planes
-from .hits import Hits as Hits
-from .hits import first_hits as first_hits
-from .hits import pictured as pictured
-from .plane import Plane as Plane
-from .plane import extent as extent
-from .surface import CHART as CHART
+from .plane import Facing, Plane, Surface, extent
+from .plane import Hits as Hits
+from .plane import first_hits as first_hits
+from .plane import pictured as pictured
+
+VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is there
+UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
+MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
+LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
+MIXED = 2  # texels round the object whose pixels show some of it
+UNUSUAL = 99  # percentile of what surface texels differ by from those near them; mixed ones differ by more
+SOFT = 8  # texels round a hole that may show some of the object
+MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
+PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
+MARGIN, LEAST_MARGIN = 0.75, 0.15  # of a hole's size, and diagonals: surface round it to fill it from
+SURFACE = 5000  # points of a chart at which drawn depths are compared
+SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
+MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that lie on another surface
+
+
+@dataclass(frozen=True)
+class Chart(Facing, Laid):
+    """A surface seen straight on, its object left out; arrays [H, W] of its camera."""
+
+    photos: np.ndarray  # uint16, how many show it
+    below: np.ndarray  # bool, known only from what the object's rough mask covers
+    rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
+    scatter: float  # relative z by which the views' drawn surfaces scatter about it
+    tolerance: float  # the same, but never very small: within it a drawn surface is this one
 
 
 def chart_number(reference: str | None) -> int | None:
     """N of the reference chart:N, counted from 1; None for a view's ID."""
     found = re.fullmatch(rf"{CHART}:(\d+)", reference or "")
     return int(found[1]) if found else None
+
+
+def lay_planes(
+    planes: Sequence[Plane],
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],  # of the same views
+    region: Region,
+    settings: ChartSettings = ChartSettings(),
+) -> tuple[Laid, ...]:
+    """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
+    textures = Textures.make(witnesses)
+    flats = [_placed(plane, region, views, witnesses, settings.largest) for plane in planes]
+    laid = [lay_surface(flat, region, views, witnesses, textures, settings) for flat in flats if flat is not None]
+    return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
+
+
+def draw_charts(
+    laid: Sequence[Laid], witnesses: Sequence[Witness], region: Region, marked: Sequence[np.ndarray] = ()
+) -> tuple[Chart, ...]:
+    """What photos show of the surfaces at the planes; those without a hole are left out. Pixels of the witnesses' views
+    that are `marked`, [H, W] bool each, are to be filled whatever they show.
+    """
+    charts = [_chart(one, region, witnesses, marked) for one in laid]
+    bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
+    return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
+
+
+def _bounded(chart: Chart, charts: Sequence[Chart]) -> Chart:
+    """The chart, ended where it goes through another one that all photos show it before: a floor at a wall."""
+    points, there = chart.points().reshape(-1, 3), chart.there
+    shown = there & (chart.photos > 0)
+    for other in charts:
+        if chart.plane.crosses(other.plane):
+            behind = (other.plane.local(points)[:, 2] < 0).reshape(there.shape)
+            if shown.any() and behind[shown].mean() < MEETING:
+                there = there & ~behind
+    return replace(chart, there=there, hole=chart.hole & there)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What photos show of a surface, as far as the object's masks tell; arrays [H, W]."""
+
+    there: np.ndarray  # bool
+    image: np.ndarray  # [H, W, 3] uint8; in the hole it is what they show below the masks
+    photos: np.ndarray  # uint16, how many show it
+    hiding: np.ndarray  # uint16, in how many the object's mask covers it
+    known: np.ndarray  # bool
+    alike: np.ndarray  # bool, known without allowing for misplaced texture
+    hole: np.ndarray  # bool
+    alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
+
+
+def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
+    points, shape = laid.points(), laid.depth.shape
+    texels = points.reshape(-1, 3)
+    scatter = _scatter(texels, laid.others, witnesses)
+    tolerance = max(TOLERANCE, scatter)
+    shown = _shown(points, laid.plane, witnesses, tolerance)
+    colours = _object_colours(laid.plane, witnesses, tolerance)
+    inside, filled = in_region(region, texels).reshape(shape), _marked(texels, witnesses, marked).reshape(shape)
+    below, rests, foreign = _told_by_colours(shown, colours, inside, filled)
+    hole = _without_islands((shown.hole & ~below) | rests, ((shown.photos < 2) & shown.there) | below)
+    below &= ~hole
+    return Chart(
+        **vars(laid),
+        there=shown.there,
+        image=np.where(hole[..., None], np.uint8(0), shown.image),
+        known=(shown.known | below) & ~hole & ~foreign,
+        hole=hole,
+        photos=np.where(below, shown.hiding, shown.photos),
+        below=below,
+        rests=rests,
+        scatter=scatter,
+        tolerance=tolerance,
+    )
+
+
+def _placed(
+    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], largest: float
+) -> Surface | None:
+    """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
+
+    None if the object hides nothing of it, or no view faces what it hides.
+    """
+    diagonal = extent(region)
+    x, y = grid(2 * diagonal, PLACES)
+    hole = _unseen(ask(witnesses, plane.points(x, y).reshape(-1, 3), TOLERANCE).reshape(-1, *x.shape))
+    labels, _ = scipy.ndimage.label(hole)
+    hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
+    if not hole.any():
+        return None
+    there, cell = np.array([x[hole], y[hole]]), 4 * diagonal / PLACES
+    low, high = there.min(1) - cell, there.max(1) + cell
+    size = high - low
+    size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
+    place = plane.points(*((low + high) / 2)[:, None])[0]
+    texel = pixel_size(place, plane.normal, views)
+    return flat_surface(plane, place, size, max(texel, float(size.max()) / largest)) if texel < math.inf else None
+
+
+def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
+    """What photos show at points [H, W, 3] of a surface."""
+    said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
+    there = shown_there(said)
+    hole = _unseen(said) & there
+    image, spread, loud = mosaic(points, plane.normal, witnesses, said)
+    photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
+    limit = usual_spread(spread[there & (photos > 1) & ~hole])
+    alike = spread <= limit
+    # few photos claim to show what the object hides from most, and they do not agree: they show something before it
+    hole |= there & (photos > 0) & ~alike & (hiding > photos)
+    beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
+    below, spread_below, _ = mosaic(points, plane.normal, witnesses, beneath)
+    several = there & (photos > 1) & ~hole
+    known = several & (spread <= limit + MISPLACED * loud)
+    image = np.where(hole[..., None], below, image)
+    return _Shown(there, image, photos, hiding, known, several & alike, hole, spread_below <= limit)
+
+
+def _told_by_colours(
+    s: _Shown, object_colours: np.ndarray, inside: np.ndarray, marked: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there. And
+    what looks like the object, though photos do not agree that it lies there: it stands before the surface.
+
+    Where photos agree below it, and on the surface's colours, they show the surface. Texels right beside the object's
+    mix with it. `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the region, or `marked`.
+    """
+    far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
+    doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
+    around = s.alike & ~doubtful & (far < math.sqrt(s.hole.sum()))
+    object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
+    below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
+    below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
+    rests = object_ & s.alike  # photos would not agree on something else that stands there
+    spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
+    rests = (rests | dilated(spots, MIXED)) & (s.photos > 0)
+    hole = (s.hole & ~below) | rests
+    return below, rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0)), object_ & ~s.alike
+
+
+def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """[H, W] bool: texels beside the object, hidden in most photos, unlike all of the surface near by.
+
+    More so than what of the surface is near them: a texel is compared with those that are not right beside it. And
+    more like what photos show in the hole.
+    """
+    beside = beside & (shown.hiding > shown.photos)
+    known = shown.alike & ~hole & ~beside
+    away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 5)
+    around = known & (away <= SOFT)
+    if not around.any():
+        return around
+    foreign, usual = (_unlike_near(shown.image, texels, known) for texels in (beside, around))
+    unlike_object, usually = (_unlike_near(shown.image, texels, hole) for texels in (beside, around))
+    found = np.zeros_like(beside)
+    unusual = foreign > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
+    found[beside] = unusual & (unlike_object < np.median(usually))
+    return found
+
+
+def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """[N] RMS grey levels by which texels [H, W] bool differ from the most similar ones near by that are known.
+
+    0 where none is near. Texels within MIXED px are not compared with, as they may be mixed too.
+    """
+    rows, cols = np.nonzero(texels)
+    least = np.full(len(rows), np.inf, np.float32)
+    for down, right in np.ndindex(2 * SOFT + 1, 2 * SOFT + 1):
+        if max(abs(down - SOFT), abs(right - SOFT)) > MIXED:
+            y, x = rows + down - SOFT, cols + right - SOFT
+            there = (y >= 0) & (x >= 0) & (y < len(known)) & (x < known.shape[1])
+            there[there] = known[y[there], x[there]]
+            off = image[y[there], x[there]].astype(np.float32) - image[rows[there], cols[there]]
+            least[there] = np.minimum(least[there], (off**2).mean(-1))
+    return np.sqrt(np.where(np.isfinite(least), least, 0))
+
+
+def _without_islands(hole: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the hole with what is doubtful in it: one photo's word through a gap, or what is below masks.
+
+    The object's foot may have the surface's colours, and what stands before it shows through its mask.
+    """
+    return hole | (scipy.ndimage.binary_fill_holes(hole) & doubtful)
+
+
+def usual_spread(spread: np.ndarray) -> float:
+    """By how much photos' textures may differ and still show the surface: else they show what stands on it.
+
+    A quarter of what several photos show is taken for the surface itself.
+    """
+    return max(LEAST_SPREAD, UNLIKE * float(np.percentile(spread, 25))) if len(spread) else LEAST_SPREAD
+
+
+def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> np.ndarray:
+    """[N, 3] uint8: what photos show of the object where it is clearly nearer than the plane."""
+
+    def of(witness: Witness) -> np.ndarray:
+        c = witness.camera
+        rays = c.unproject(c.pixel_centres(), np.ones(witness.hidden.shape)) - c.centre
+        with np.errstate(divide="ignore"):
+            z = ((plane.origin - c.centre) @ plane.normal) / (rays @ plane.normal)
+        before = witness.depth < (1 - tolerance) * np.where(z > 0, z, np.inf)
+        return witness.photo[witness.hidden & (witness.depth > 0) & before]
+
+    return np.concatenate(parallel_map(of, witnesses))
+
+
+def _marked(points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> np.ndarray:
+    """[N] bool: points [N, 3] that the user marked in some view."""
+    found = np.zeros(len(points), bool)
+    for witness, mask in zip(witnesses, marked):
+        if mask.any():
+            found |= sees(witness.camera, mask.astype(np.float32), points, np.inf)
+    return found
+
+
+def _scatter(surface: np.ndarray, others: Sequence[Plane], witnesses: Sequence[Witness]) -> float:
+    """How far, relative to z, the views' drawn surfaces scatter about points [N, 3] of one: three standard deviations.
+
+    What lies behind the others that it may meet, such as a wall, says nothing of how a floor's depths scatter.
+    """
+    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
+    surface = surface[before] if before.sum() > TELLING else surface
+    some, off = surface[:: max(1, len(surface) // SURFACE)], [np.zeros(0)]
+    for witness in witnesses:
+        _, rows, cols, z = framed(witness.camera, some)
+        front = witness.depth[rows, cols]
+        shown = ~witness.hidden[rows, cols] & (front > 0)
+        off.append(front[shown] / z[shown] - 1)
+    found = np.abs(np.concatenate(off))
+    return min(SCATTER * float(np.median(found)), MOST_SCATTER) if len(found) else 0.0
+
+
+def _unseen(said: np.ndarray) -> np.ndarray:
+    """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
+    seen = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).sum(0)
+    hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
+    return (seen == 0) & (hidden > behind)
+
+
+def shown_there(said: np.ndarray) -> np.ndarray:
+    """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so round it."""
+    seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
+    through = (said == Says.THROUGH).sum(0)
+    known = seen + through > 0
+    if not known.any():
+        return np.ones(known.shape, bool)
+    # single texels beside the object's foot err; edges of tables are long
+    votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
+    return carried(votes[..., None].repeat(3, -1), known)[..., 0] >= 0

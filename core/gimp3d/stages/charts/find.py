@@ -1,23 +1,27 @@
-"""The planes that run into what the object hid: sought among drawn depths, settled where photos agree on them."""
+"""The planes that run into what the object hid, settled where photos agree on them, and where the surface at each lies.
+
+Planes are sought among drawn depths. Their surfaces lie on them, or on the relief that the views draw over them.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from ...box import Region, in_region
+from ...camera import Camera
 from ...compute.threads import parallel_map
-from ...geometry import SOLID, surface_points
+from ...geometry import SOLID, WHOLE, framed, surface_points, window_round
 from ...schema import AtLeastOne, Share
+from ...solvers.thin_plate import thin_plate
 from ..masks import ViewMasks
 from ..witness import AGREEING, Says, Textures, Witness, ask
-from .plane import Plane, extent, largest_plane
+from .plane import Plane, Surface, extent, largest_plane
 
 TOLERANCE = 0.05  # relative z by which a view's surface must be nearer to hide a point: rough scans scatter by 3 to 9 %
 MIXED_RIM = 2.0  # px beside the object whose depths may be its own
@@ -34,6 +38,13 @@ SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sough
 TILT = 0.2  # slope by which it is tilted to begin with: rough depths were 8° off (kitchen_monkey)
 TRIED = 3  # planes of the coarsest level that are followed up
 STEP, COARSE_STEP, FINE_STEP = 0.01, 0.0025, 1e-4  # the pattern search's first and last ones: offset in diagonals
+CHART = "chart"  # split of the cameras that face surfaces
+MARGIN = 8  # px of a view round the part that may show the surface
+CELL = 2  # px of such a camera, side of the cells in which drawn surface is gathered
+ENOUGH_POINTS = 3  # of a cell
+TELLING = 100  # cells or texels that tell how depths lie
+HEIGHT = 0.25  # diagonals of the region, of a relief at most: what is higher stands on the surface
+SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
 
 
 @dataclass(frozen=True)
@@ -46,17 +57,17 @@ class ChartSettings:
 
 
 @dataclass(frozen=True)
-class _Round:
-    """Surface that the views show round the object."""
+class Beside:
+    """Points of the solid surfaces that views show beside the object."""
 
     points: np.ndarray  # [N, 3]
     eyes: np.ndarray  # [N, 3] where the view stood that shows it
     weight: np.ndarray  # [N], how much it tells of what the object hid
 
-    def take(self, rows: np.ndarray) -> _Round:
-        return _Round(self.points[rows], self.eyes[rows], self.weight[rows])
+    def take(self, rows: np.ndarray) -> Beside:
+        return Beside(self.points[rows], self.eyes[rows], self.weight[rows])
 
-    def some(self, count: int) -> _Round:
+    def some(self, count: int) -> Beside:
         """At most so many, drawn by what they tell."""
         if len(self.points) <= count:
             return self
@@ -77,12 +88,9 @@ def surface_depth_beside(view: ViewMasks, witness: Witness) -> np.ndarray:
 
 
 def surface_beside(
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],
-    most: int,  # points, about
-    within: tuple[float, float] = (0.0, math.inf),  # px from the object
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points [N, 3] of the solid surfaces that views show beside the object, and where each view stands [N, 3]."""
+    views: Sequence[ViewMasks], witnesses: Sequence[Witness], most: int, within: tuple[float, float] = (0.0, math.inf)
+) -> Beside:
+    """About as many points as are asked for, all of the same weight, within so many px from the object."""
 
     def of(view: ViewMasks, witness: Witness) -> tuple[np.ndarray, np.ndarray]:
         far = cv2.distanceTransform((~witness.hidden).astype(np.uint8), cv2.DIST_L2, 5)
@@ -91,22 +99,20 @@ def surface_beside(
         points = surface_points(view.camera, depth, step=step)[2]
         return points, np.broadcast_to(view.camera.centre, points.shape)
 
-    parts = parallel_map(lambda p: of(*p), list(zip(views, witnesses)))
-    points, eyes = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    return points, eyes
+    points, eyes = (np.concatenate(p) for p in zip(*parallel_map(lambda p: of(*p), zip(views, witnesses))))
+    return Beside(points, eyes, np.ones(len(points)))
 
 
-def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> _Round:
-    points, eyes = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
-    outside = ~in_region(region, points)
-    points, eyes = points[outside], eyes[outside]
-    said = ask(witnesses, points, TOLERANCE)
+def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> Beside:
+    beside = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
+    beside = beside.take(~in_region(region, beside.points))
+    said = ask(witnesses, beside.points, TOLERANCE)
     share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
     near = share > HIDDEN
     # few views, or all from one place: what is beside the object is all that tells
     if len(views) < AGREEING or not near.any():
-        near, share = np.ones(len(points), bool), np.ones(len(points))
-    return _Round(points[near], eyes[near], share[near] ** 2)
+        return beside
+    return replace(beside, weight=share**2).take(near)
 
 
 def find_planes(
@@ -116,24 +122,20 @@ def find_planes(
     settings: ChartSettings = ChartSettings(),
     settled: bool = True,  # by photos; else as splats draw them
 ) -> tuple[Plane, ...]:
-    """The planes nearest to the surfaces that run into what the object hid.
+    """The planes nearest to the surfaces that run into what the object hid, sought among points of surface round it.
 
-    Planes are sought among the points of surface round the object, each counting by the square of the share of views
-    in which the object hides it: what is hidden often lies near what is hidden always. Each is then settled where the
-    photos' textures agree best, since the depths of rough splats do not tell: at the pixels that led to it, and round
-    the object on its side of the other planes, or it would tilt towards what is painted on those. And of two planes
-    that could both be what some pixels show photos choose as well.
+    Each counts by the square of the share of views in which the object hides it: what is hidden often lies near what is
+    hidden always. Planes are then settled where photos' textures agree best, as rough splats' depths do not tell: at
+    the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
+    painted on those. Of two planes that could both be what some pixels show photos choose as well.
     """
-    diagonal = extent(region)
-    around = _surface_round(views, witnesses, region)
-    levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
-    textures = levels[-1]
-    cameras = np.array([v.camera.centre for v in views])
-    rng, left = np.random.default_rng(0), around
-    sought: list[tuple[Plane, _Round]] = []
-    while len(sought) < MOST:
+    diagonal, levels = extent(region), [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
+    textures, cameras = levels[-1], np.array([v.camera.centre for v in views])
+    left, rng = _surface_round(views, witnesses, region), np.random.default_rng(0)
+    least, sought = settings.least * left.weight.sum(), list[tuple[Plane, Beside]]()
+    for _ in range(MOST):
         candidate = largest_plane(left.points, left.weight, INLIER * diagonal, cameras, region, rng)
-        if candidate is None or left.weight[candidate[1]].sum() < settings.least * around.weight.sum():
+        if candidate is None or left.weight[candidate[1]].sum() < least:
             break
         plane, on = candidate
         sought.append((plane, left.take(on)))
@@ -155,14 +157,13 @@ def find_planes(
     return tuple(planes)
 
 
-def grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places on a square, [count, count] each."""
+def grid(half: float, count: int) -> np.ndarray:
+    """x and y of places on a square, [2, count, count]."""
     side = ((np.arange(count) + 0.5) / count * 2 - 1) * half
-    x, y = np.meshgrid(side, side)
-    return x, y
+    return np.array(np.meshgrid(side, side))
 
 
-def _bounds(plane: Plane, own: _Round, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
+def _bounds(plane: Plane, own: Beside, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
     """The planes that a plane ends at, and on which side of them its own points lie: 1 above, −1 below."""
     bounds = []
     for other in others:
@@ -178,7 +179,7 @@ class _Claim:
     """Pixels that seem to show one plane, and a rough guess of it."""
 
     plane: Plane
-    own: _Round
+    own: Beside
     bounds: list[tuple[Plane, int]]  # see _bounds
     half: float  # diagonals of the region
 
@@ -189,11 +190,13 @@ class _Claim:
         points, there = self.plane.points(x, y), np.ones(len(x), bool)
         for other, side in self.bounds:
             there &= side * other.local(points)[:, 2] > 0
-        return partial(self._agreement, x[there], y[there], self.own.some(count**2 // OWN), textures)
+        x, y, own = x[there], y[there], self.own.some(count**2 // OWN)
 
-    def _agreement(self, x: np.ndarray, y: np.ndarray, own: _Round, textures: Textures, pose: np.ndarray) -> float:
-        round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
-        return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+        def by(pose: np.ndarray) -> float:
+            round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
+            return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+
+        return by
 
     def at(self, pose: np.ndarray) -> Plane:
         """The guess moved and tilted by [3]: offset over `half`, two slopes."""
@@ -214,8 +217,7 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
     """
     sweep, tilts = np.linspace(-1, 1, SWEEP) * SEARCH, (-TILT, 0.0, TILT)
     anywhere = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
-    best, at = 0.0, np.zeros(3)
-    reached: list[np.ndarray] = []
+    best, reached = 0.0, list[np.ndarray]()
     for shrink, textures in zip(LEVELS, levels):
         finest = shrink == LEVELS[-1]
         agreement = claim.agreement(textures, shrink)
@@ -223,7 +225,7 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
         starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
         reached = [at]
-    return best, claim.at(at) if best > 0 else claim.plane
+    return best, claim.at(reached[0]) if best > 0 else claim.plane
 
 
 def _best_known(
@@ -232,8 +234,7 @@ def _best_known(
     """Where photos agree better still: climbed from where other claims settled, of one surface that looked like two."""
     agreement = claim.agreement(textures)
     starts = [claim.pose_of(p) for p in known if p is not plane and not p.crosses(claim.plane)]
-    better = [start for start in _best_of(agreement, starts, 1) if agreement(start) > best]
-    found = [_climbed(agreement, start, FINE_STEP) for start in better]
+    found = [_climbed(agreement, s, FINE_STEP) for s in _best_of(agreement, starts, 1) if agreement(s) > best]
     return (found[0][0], claim.at(found[0][1])) if found else (best, plane)
 
 
@@ -254,3 +255,100 @@ def _climbed(agreement: Callable[[np.ndarray], float], start: np.ndarray, least:
         else:
             step /= 2
     return best, at
+
+
+@dataclass(frozen=True)
+class Laid(Surface):
+    """A surface where it lies as far as photos tell."""
+
+    kind: str  # plane | relief
+    agreement: float  # of photos on it, see Textures
+    noise: float  # median distance of the views' drawn surfaces from the plane, scene units
+    others: tuple[Plane, ...]  # planes that it may meet
+    reason: str
+
+
+def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float) -> Surface:
+    """A rectangle of a plane, of a size [2] and round a place, as a camera faces it, with texels of one side."""
+    width, height = (int(n) for n in np.ceil(size / texel))
+    away = 4 * float(np.linalg.norm(size))
+    rotation = np.stack([plane.right, -plane.down, -plane.normal])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (place + away * plane.normal)
+    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART)
+    return Surface(plane, camera, np.full((height, width), away, np.float32))
+
+
+def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
+    """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
+    density = []
+    for camera in (v.camera for v in views):
+        z, towards = camera.project(place[None])[1][0], camera.centre - place
+        cosine = float((towards @ normal) / np.linalg.norm(towards))
+        if z > 0 and cosine > 0:
+            density.append(camera.fx * camera.fy * cosine / z**2)
+    return 1 / math.sqrt(float(np.percentile(density, 90))) if density else math.inf
+
+
+def lay_surface(
+    flat: Surface,  # at the plane
+    region: Region,
+    views: Sequence[ViewMasks],
+    witnesses: Sequence[Witness],
+    textures: Textures,
+    settings: ChartSettings = ChartSettings(),
+    enough: float = math.inf,  # points that tell where a few texels lie, where views show more
+) -> Laid:
+    """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
+
+    def at(offset: np.ndarray | float, kind: str) -> Laid:
+        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, np.nan, (), "")
+        agreement = textures.agreement(laid.points().reshape(-1, 3))
+        return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
+
+    level, diagonal = at(0.0, "plane"), extent(region)
+    offset, known = _drawn_surface(flat, views, witnesses, HEIGHT * diagonal, enough)
+    if known.sum() < TELLING:
+        return level
+    completed = np.nan_to_num(thin_plate(offset, known.astype(float), np.ones(known.shape, bool))).astype(np.float32)
+    relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
+    # splats are drawn a little behind the surface that they show: new ones must lie where they do
+    near = offset[known & (np.abs(offset) < SINKS * diagonal)]
+    sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
+    return replace(
+        relief if 1 - relief.agreement < settings.relief * (1 - level.agreement) else sunk,
+        reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
+        noise=float(np.median(np.abs(offset[known]))),
+    )
+
+
+def _drawn_surface(
+    flat: Surface, views: Sequence[ViewMasks], witnesses: Sequence[Witness], height: float, enough: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """z of what views draw no higher than so much over a plane less the plane's, in cells of a few texels, and where
+    that is known. Both [h, w]; the median over the views' points.
+    """
+    camera, away = flat.camera, flat.depth[0, 0]
+    h, w = -(-camera.height // CELL), -(-camera.width // CELL)
+    ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
+    corners = camera.unproject(ends, np.full(4, away, float))
+    middle = corners.mean(0)
+
+    def of(view: ViewMasks, witness: Witness) -> np.ndarray:
+        uv, front = view.camera.project(corners)
+        window = window_round(uv, view.camera, MARGIN) if (front > 0).all() else WHOLE
+        z_there = float(view.camera.project(middle[None])[1][0])
+        side = CELL * away / camera.fx * view.camera.fx / z_there if z_there > 0 else 1  # of a cell, in px
+        step = max(1, int(side * math.sqrt(len(views) / enough)))
+        points = surface_points(view.camera, surface_depth_beside(view, witness), window, step)[2]
+        points = points[np.abs(flat.plane.local(points)[:, 2]) < height]
+        _, rows, cols, z = framed(camera, points)
+        return np.stack([rows // CELL * w + cols // CELL, z], -1)
+
+    found = np.concatenate(parallel_map(lambda p: of(*p), zip(views, witnesses)))
+    key, z = found[np.lexsort((found[:, 1], found[:, 0]))].T
+    count = np.bincount(key.astype(int), minlength=h * w)
+    known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
+    value[known] = z[(np.cumsum(count) - count + count // 2)[known]]
+    value, known = value.reshape(h, w), known.reshape(h, w)
+    return np.where(known, value - away, 0), known

@@ -6,6 +6,7 @@ hole. `paper` is how the paper does it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import fields
@@ -18,12 +19,9 @@ from ...errors import BadInput
 from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
 from ...progress import Progress, silent
 from .blend import blend_band, to_bytes
-from .paper import Lent, Mapped, Sources, blend_rim, lent_colours, sampled
-from .types import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint
-from .warp import Picture, picture_of, warp_reference
+from .paper import Sampler, Sources, blend_rim, sampler
+from .warp import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint, warp_reference
 
-TRANSFERS = ("warp", "sample")
-BLENDS = ("band", "rim")
 SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area
 LEAST_REACH = 16  # px of that
 BAND = 1 / 8  # of that: the strip round the hole that the blend is fitted to most
@@ -48,29 +46,24 @@ def propagate(
     """Paint the hole of every view. Painted views are never sources for others: order is irrelevant.
 
     `sources` is the mapping field, rows and columns [H, W] int32 of each of the reference's target pixels' source, -1 =
-    none: only the paper's sampling asks for it.
-
-    As many views are in memory as threads work on them; what is kept of each is the part round its hole.
+    none: only the paper's sampling asks for it. As many views are in memory as threads work on them, and of each the
+    part round its hole is kept.
 
     Raises
     ------
     BadInput
         If the transfer or the blend is unknown.
     """
-    for name, value, known in (("transfer", settings.transfer, TRANSFERS), ("blend", settings.blend, BLENDS)):
-        if value not in known:
+    for name, known in (("transfer", ("warp", "sample")), ("blend", ("band", "rim"))):
+        if (value := getattr(settings, name)) not in known:
             raise BadInput(f"propagate: unknown {name} {value!r}; use {', '.join(known)}")
-    mapped = Mapped.of(reference, sources) if sources is not None and settings.transfer == "sample" else None
-    lent = lent_colours(mapped, views, settings) if mapped else ()
-    picture = picture_of(reference)
-    done = 0
+    sample = sampler(reference, sources, views, settings) if sources and settings.transfer == "sample" else None
+    done = itertools.count(1)
 
     def paint(load: Loader) -> PaintedView:
-        nonlocal done
         view = load()
-        painted = _painted(reference, picture, view, mapped, lent, settings)
-        done += 1
-        progress("propagate", done, len(views), view.camera.id)
+        painted = _painted(reference, view, sample, settings)
+        progress("propagate", next(done), len(views), view.camera.id)
         return painted
 
     painted = tuple(parallel_map(paint, views, at_once(reference.target.size)))
@@ -81,19 +74,14 @@ def propagate(
 
 
 def _painted(
-    reference: Reference,
-    picture: Picture,  # the reference's
-    view: ViewToPaint,
-    mapped: Mapped | None,
-    lent: Sequence[Lent],
-    settings: PropagateSettings,
+    reference: Reference, view: ViewToPaint, sample: Sampler | None, settings: PropagateSettings
 ) -> PaintedView:
     """One view: what of it is photo of the new surface, the rest warped and blended."""
     if not view.target.any():
         nothing = np.zeros((0, 0, 3), np.uint8)
         return PaintedView(view.camera.id, 0, 0, nothing, nothing, nothing[..., 0], np.zeros((0, 0), np.float32))
-    reach = _reach(view.target)
-    near, top, left = _cropped(view, reach)
+    reach, part = _reach(view.target), near_hole(view.target)
+    near = ViewToPaint(cropped(view.camera, part), *(getattr(view, f.name)[part] for f in fields(view)[1:]))
     same = same_surface(near.depth_before, near.depth_new, EVIDENCE_DEPTH)  # the photo's surface is the new one
     evidence = near.target & same & ~near.silhouette  # what the removed Gaussians show, such as a shadow, is none
     hole = near.target & ~evidence
@@ -101,33 +89,22 @@ def _painted(
     distance = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     photo = ~near.silhouette & same & ~hole & (distance <= reach)
     depth = np.ascontiguousarray(near.depth_new, np.float32)
-    warp = warp_reference(picture, near.camera, depth, hole | photo)
-    painted, photo = hole & warp.reached, photo & warp.reached
+    warp = warp_reference(reference, near.camera, depth, hole | photo)
+    reached = ~np.isnan(warp.u)
+    painted, photo = hole & reached, photo & reached
     photo[photo] = warp.lookup(reference.source | reference.target, photo)
     rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
-    rules[painted] = Rule.REFERENCE if mapped is not None else Rule.OWN_PIXELS
+    rules[painted] = Rule.REFERENCE if sample else Rule.OWN_PIXELS
+    if sample:
+        sample(view, warp, rules)
     raw = warp.colours
-    if mapped is not None:
-        raw, rules = sampled(mapped, view, lent, warp, rules, settings.retarget)
     if settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
     else:
         blended = blend_band(base, raw, painted, photo, BAND * reach, depth)
     rules[evidence] = Rule.EVIDENCE
-    rows, cols = bounds(near.target)
-    return PaintedView(
-        view.camera.id,
-        top + rows.start,
-        left + cols.start,
-        blended[rows, cols].copy(),
-        to_bytes(np.where(painted[..., None], raw, base)[rows, cols]),
-        rules[rows, cols].copy(),
-        near.depth_new[rows, cols].astype(np.float32),
-    )
-
-
-def _cropped(view: ViewToPaint, margin: int) -> tuple[ViewToPaint, int, int]:
-    """The part of the view round its target, which is not empty, and where it begins."""
-    part = bounds(view.target, margin)
-    arrays = (getattr(view, f.name)[part] for f in fields(view) if f.name != "camera")
-    return ViewToPaint(cropped(view.camera, part), *arrays), part[0].start, part[1].start
+    rows, cols = hole_alone = bounds(near.target)
+    top, left = part[0].start + rows.start, part[1].start + cols.start
+    unblended = to_bytes(np.where(painted[..., None], raw, base)[hole_alone])
+    shown, told = blended[hole_alone].copy(), rules[hole_alone].copy()
+    return PaintedView(view.camera.id, top, left, shown, unblended, told, near.depth_new[hole_alone].astype(np.float32))

@@ -7,8 +7,9 @@ view's pixel (`transfer="sample"`); what is painted is blended to its rim (`blen
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,14 +21,14 @@ from ...geometry import SAME_DEPTH, colours_at
 from ...solvers.poisson import solve_poisson
 from ...solvers.robust import exposure_gain
 from .blend import SEAM, SQUARE, to_bytes
-from .types import Loader, PropagateSettings, Reference, Rule, ViewToPaint
-from .warp import Picture, Warp, picture_of, shown_at
+from .warp import Loader, Picture, PropagateSettings, Reference, Rule, ViewToPaint, Warp, picture_of, shown_at
 
 RADIUS = 2  # px of the overlapping patches that are compared and blended (paper 4.1: 5 × 5)
 ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source is alike
 OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
 
 Sources = tuple[np.ndarray, np.ndarray]  # see propagate
+Sampler = Callable[[ViewToPaint, Warp, np.ndarray], None]  # see _sample
 
 
 @dataclass(frozen=True)
@@ -73,30 +74,28 @@ class Lent:
     gain: np.ndarray  # [3] its exposure over the reference's
 
 
-def lent_colours(mapped: Mapped, views: Sequence[Loader], settings: PropagateSettings) -> tuple[Lent, ...]:
-    """A few views' pixels at the mapped sources, for views that do not show them."""
-    count = min(settings.donors, len(views))
+def sampler(reference: Reference, sources: Sources, views: Sequence[Loader], settings: PropagateSettings) -> Sampler:
+    """Algorithm 1's sampling of any view; a few of the views lend it pixels at mapped sources that it does not show."""
+    mapped, count = Mapped.of(reference, sources), min(settings.donors, len(views))
     chosen = [views[k * len(views) // count] for k in range(count)]
-    return tuple(parallel_map(lambda load: _lend(mapped, load()), chosen))
+    lent = parallel_map(lambda load: _lend(mapped, load()), chosen)
+    return partial(_sample, mapped, lent, settings.retarget)
 
 
-def sampled(
-    mapped: Mapped, view: ViewToPaint, lent: Sequence[Lent], warp: Warp, rules: np.ndarray, retarget: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Algorithm 1's sampling: colours [h, w, 3] float32 and rules [h, w] of the hole. `rules` [h, w] uint8 come in as
-    REFERENCE where the warp reaches the hole; `retarget` is in px.
+def _sample(
+    mapped: Mapped, lent: Sequence[Lent], retarget: int, view: ViewToPaint, warp: Warp, rules: np.ndarray
+) -> None:
+    """Change the warp's colours to sampled ones, and `rules` [h, w] uint8 from REFERENCE, as which they come in where
+    the warp reaches the hole. `retarget` is in px.
     """
     *sources, source_rules = mapped.shown_in(picture_of(view), retarget)
     reached = rules == Rule.REFERENCE
     found = np.append(source_rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
-    raw, rules = warp.colours.copy(), rules.copy()
     rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
     rows, cols = np.nonzero(reached)
-    places = rows, cols, warp.u, warp.v
     taken = mapped.index, *sources, source_rules, *_borrowed(mapped, view, source_rules == 0, lent)
-    pictures = mapped.picture, picture_of(view)
-    run_ranges(_sample_range, len(rows), *places, *taken, *pictures, SAME_DEPTH, RADIUS, raw, rules)
-    return raw, rules
+    given = rows, cols, warp.u, warp.v, *taken, mapped.picture, picture_of(view), SAME_DEPTH, RADIUS
+    run_ranges(_sample_range, len(rows), *given, warp.colours, rules)
 
 
 def _borrowed(
@@ -104,10 +103,8 @@ def _borrowed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """[M, 3] colours of wanted sources in the nearest view that shows them, at this exposure; [M] bool: there."""
     colours, has = np.zeros((len(wanted), 3), np.float32), np.zeros(len(wanted), bool)
-    others = sorted(
-        (x for x in lent if x.camera.id != view.camera.id),
-        key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id),
-    )
+    others = [x for x in lent if x.camera.id != view.camera.id]
+    others.sort(key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id))
     gain = _lend(mapped, view).gain if others else np.ones(3)
     for other in others:
         new = other.seen & wanted & ~has
@@ -120,9 +117,8 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
     seen = mapped.shown_in(picture_of(view), reach=0)[2] > 0
     reference, camera = mapped.reference, view.camera
     rows, cols = mapped.source_rows[seen], mapped.source_cols[seen]
-    points = reference.camera.unproject(
-        np.stack([cols + 0.5, rows + 0.5], -1), mapped.picture.depth[rows, cols].astype(np.float64)
-    )
+    z = mapped.picture.depth[rows, cols].astype(np.float64)
+    points = reference.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
     colours = np.zeros((len(seen), 3), np.float32)
     colours[seen] = colours_at(view.image, camera.project(points)[0])
     return Lent(camera, colours, seen, exposure_gain(reference.image[rows, cols], colours[seen]))
@@ -131,11 +127,10 @@ def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
 def blend_rim(
     base: np.ndarray, raw: np.ndarray, painted: np.ndarray, no_photo: np.ndarray, depth: np.ndarray
 ) -> np.ndarray:
-    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32, its rim as in the view `base`
-    [H, W, 3] uint8. `painted` [H, W] bool is where the fill is, `no_photo` [H, W] bool what bounds none: the rest of
-    the hole, renderings of the emptied scene; `depth` [H, W] is z of the new scene.
-
-    The rim counts only where no depth seam parts it from the fill. Parts without a rim keep their own colours.
+    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32 where it is `painted` [H, W]
+    bool, its rim as in the view `base` [H, W, 3] uint8, but for `no_photo` [H, W] bool: the rest of the hole, drawings
+    of the emptied scene. The rim counts only where no seam of `depth`, [H, W] z of the new scene, parts it from the
+    fill. Parts without a rim keep their own colours.
     """
     if not painted.any():
         return base.copy()
@@ -143,11 +138,8 @@ def blend_rim(
     nearest_fill = cv2.dilate(np.where(painted & (depth > 0), depth, 0).astype(np.float32), SQUARE)
     rim &= np.abs(nearest_fill - depth) < SEAM * depth
     solution = solve_poisson(painted, rim, base, np.where(painted[..., None], raw, np.nan).astype(np.float32))
-    result = base.copy()
-    anchored = painted & ~solution.unanchored
-    result[anchored] = to_bytes(solution.values[anchored])
-    free = painted & solution.unanchored
-    result[free] = to_bytes(raw[free])
+    result, free = base.copy(), solution.unanchored[..., None]
+    result[painted] = to_bytes(np.where(free, raw, solution.values)[painted])
     return result
 
 

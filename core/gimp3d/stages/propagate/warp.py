@@ -1,4 +1,4 @@
-"""Where the surface that a view shows lies in the reference, and the reference's colours there.
+"""What goes into the propagation and what comes out; where the surface that a view shows lies in the reference.
 
 The warp runs backward, from the new surface as view t sees it to the reference: no cracks, one sample per pixel.
 """
@@ -6,8 +6,10 @@ The warp runs backward, from the new surface as view t sees it to the reference:
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,7 +17,93 @@ from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import run_ranges
 from ...geometry import SAME_DEPTH, pack_camera, project, unproject
-from .types import Reference, ViewToPaint
+
+
+class Rule(IntEnum):
+    """How a pixel of T_t got its colour."""
+
+    UNTOUCHED = 0
+    EVIDENCE = 1  # the photo shows the new surface itself here: T reaches beyond the object
+    OWN_PIXELS = 2  # by the view's own: fitted to those round the hole, or (paper) those at the mapped source
+    REFERENCE = 3  # the warped reference colour (paper: where nothing shows the mapped source)
+    UNREACHED = 4  # the reference does not see this surface
+    RETARGETED = 5  # by the view's own pixels near the mapped source, which is itself hidden or off-screen
+    OTHER_VIEW = 6  # the mapped source as another view shows it
+    REFINED = 7  # by whoever --refine-views asked; the last one, as it comes after the propagation
+
+
+@dataclass(frozen=True)
+class PropagateSettings:
+    """How a view is painted: by default what was measured to be best, else as in the paper."""
+
+    # warp: the reference's colours; sample: the colours of this view's mapped sources (paper)
+    transfer: Literal["warp", "sample"] = "warp"  # way; the reference's texture against the view's light
+    # band: fitted to the photo round the hole; rim: to the rim's pixels alone (paper)
+    blend: Literal["band", "rim"] = "band"  # way; an even level against no seam at any pixel of the rim
+    retarget: int = 32  # px searched round a source that is not to be seen (sample only); time against more own pixels
+    donors: int = 8  # views that lend samples of sources a view does not show (sample only); time against holes
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The completed reference view."""
+
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] uint8, inpainted
+    depth: np.ndarray  # [H, W] float32, completed
+    target: np.ndarray  # [H, W] bool, T_0
+    source: np.ndarray  # [H, W] bool, pixels that show a photo's unhidden surface
+
+
+@dataclass(frozen=True)
+class ViewToPaint:
+    """A view before its hole is painted."""
+
+    camera: Camera
+    image: np.ndarray  # [H, W, 3] uint8, the photo (or rendering) with the object
+    base: np.ndarray  # [H, W, 3] uint8, without the object: the photo round it, the emptied scene where it was
+    silhouette: np.ndarray  # [H, W] bool, touched by the object
+    target: np.ndarray  # [H, W] bool, T_t
+    depth_before: np.ndarray  # [H, W] z with the object
+    depth_new: np.ndarray  # [H, W] z of the scene with the new surface; used within `near_hole`
+
+
+Loader = Callable[[], ViewToPaint]  # brings a view into memory; it is let go again once it is painted
+
+
+@dataclass(frozen=True)
+class PaintedView:
+    """The part of a view round its painted hole."""
+
+    camera_id: str
+    top: int  # row and column of the view where the part begins
+    left: int
+    image: np.ndarray  # [h, w, 3] uint8, I_t*
+    raw: np.ndarray  # [h, w, 3] uint8, before Poisson blending
+    rules: np.ndarray  # [h, w] uint8, see Rule
+    depth: np.ndarray  # [h, w] z of the scene with the new surface
+
+    def pasted(self, picture: np.ndarray, part: np.ndarray | None = None) -> np.ndarray:
+        """The picture [H, W, 3] uint8, this part's hole pasted in: from `part` [h, w, 3], by default `image`."""
+        whole = picture.copy()
+        h, w = self.rules.shape
+        place = whole[self.top : self.top + h, self.left : self.left + w]
+        there = self.rules != Rule.UNTOUCHED
+        place[there] = (self.image if part is None else part)[there]
+        return whole
+
+    def rule_map(self, height: int, width: int) -> np.ndarray:
+        """The rules in the whole view, [height, width] uint8."""
+        return self.pasted(np.zeros((height, width), np.uint8), self.rules)
+
+
+@dataclass(frozen=True)
+class Propagation:
+    """Every view painted, in the order given."""
+
+    views: tuple[PaintedView, ...]
+    confidence: float
+    reason: str
 
 
 class Picture(NamedTuple):
@@ -29,10 +117,7 @@ class Picture(NamedTuple):
 
 def picture_of(view: ViewToPaint | Reference) -> Picture:
     """The view with the object, or the completed reference."""
-    if isinstance(view, Reference):
-        depth, usable = view.depth, view.source
-    else:
-        depth, usable = view.depth_before, ~view.silhouette
+    depth, usable = (view.depth, view.source) if isinstance(view, Reference) else (view.depth_before, ~view.silhouette)
     arrays = np.asarray(depth, np.float32), view.image, usable
     return Picture(pack_camera(view.camera), *(np.ascontiguousarray(a) for a in arrays))
 
@@ -45,28 +130,19 @@ class Warp:
     u: np.ndarray  # [h, w] where it lies in the reference; NaN: the reference does not show it, or nobody asked
     v: np.ndarray
 
-    @property
-    def reached(self) -> np.ndarray:
-        """[h, w] bool: pixels whose surface the reference shows."""
-        return ~np.isnan(self.u)
-
-    def lookup(
-        self,
-        picture: np.ndarray,  # [H, W, ...] of the reference
-        where: np.ndarray,  # [h, w] bool, reached
-    ) -> np.ndarray:
-        """The picture's values at those pixels, [N, ...]."""
+    def lookup(self, picture: np.ndarray, where: np.ndarray) -> np.ndarray:
+        """The values [N, ...] of a picture [H, W, ...] of the reference at pixels `where` [h, w] bool, all reached."""
         return picture[self.v[where].astype(int), self.u[where].astype(int)]
 
 
-def warp_reference(reference: Picture, camera: Camera, depth: np.ndarray, wanted: np.ndarray) -> Warp:
+def warp_reference(reference: Reference, camera: Camera, depth: np.ndarray, wanted: np.ndarray) -> Warp:
     """The reference's colours at the `wanted` [h, w] bool pixels of a part of a view, and the places they come from.
     `camera` is the part's, `depth` [h, w] float32 z of its new surface.
     """
     rows, cols = np.nonzero(wanted)
-    colours = np.zeros((*wanted.shape, 3), np.float32)
-    u, v = np.full((2, *wanted.shape), np.nan)
-    run_ranges(_warp_range, len(rows), rows, cols, pack_camera(camera), depth, reference, SAME_DEPTH, colours, u, v)
+    colours, (u, v) = np.zeros((*wanted.shape, 3), np.float32), np.full((2, *wanted.shape), np.nan)
+    given = rows, cols, pack_camera(camera), depth, picture_of(reference), SAME_DEPTH
+    run_ranges(_warp_range, len(rows), *given, colours, u, v)
     return Warp(colours, u, v)
 
 

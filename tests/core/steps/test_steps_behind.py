@@ -19,8 +19,8 @@ from gimp3d.stages import refine
 from gimp3d.stages.charts import pictured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.propagate import Rule
-from gimp3d.steps.coverage import emptied
-from gimp3d.steps.relearning import observed_round, take_painted_colours
+from gimp3d.steps.behind import observed_round, take_painted_colours
+from gimp3d.steps.references import emptied
 
 SETTINGS = replace(PRESETS["balanced"], refine=replace(PRESETS["balanced"].refine, steps=50), shadow="off")
 SPOILT = 0.3  # scene units round the block

@@ -1,0 +1,325 @@
+"""What is behind the object: its surfaces and their charts, their light without it, and what stays, learned again.
+
+Planes run in behind the object; of their charts follows what is air, and T. Its shadow and its reflection are found and
+undone. Splats round it were fitted with the object's before and among them: photos teach them again. And after the hole
+is filled, what is drawn before the new Gaussians takes their colours: where drawn depths scatter, splats of the floor
+lie before the floor that photos tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..box import Region
+from ..errors import IllPosed
+from ..gaussians import SH_C0, Gaussians
+from ..presets import RemovalSettings
+from ..progress import Progress
+from ..raster import label_weights
+from ..stages.charts import Chart, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
+from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
+from ..stages.contact import find_contact
+from ..stages.ground import look_at
+from ..stages.lifting import Lifted, bare_photos, lift, recoloured
+from ..stages.masks import Masks
+from ..stages.occluder import support_first
+from ..stages.refine import Observation, looked_at, refine_gaussians
+from ..stages.reflection import Reflection, find_reflection
+from ..stages.seed import OWN_RULES
+from ..stages.selection import Selection, near_region
+from ..stages.shadow import Shadow, find_shadow, marked_shadow
+from ..stages.witness import Witness, total_over
+from ..view_state import ViewState
+from .references import emptied
+
+NO_SHADOW = {"found": False, "lights": [], "explained": 0.0}
+NO_REFLECTION = {"found": False, "explained": 0.0}
+LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them (kitchen_monkey −0.2 dB, real_bed −0.1)
+ROUND = 24  # px round the object in which photos teach
+PLACE, ELSEWHERE = 1, 2  # labels of a view's pixels: the object's place, and all others
+SHOWN = 2.0  # px of blend weight in the object's place, over all views, from which a Gaussian learns
+SHARE = 0.1  # of all its weight; what draws other places more than this one is left alone
+LARGEST = 0.5  # diagonals of the region, σ: giants of the background show in many places
+SMOOTHING = 1.0  # px, σ by which splats and charts are blurred before they are compared
+VISIBLE = 0.5 / 255  # change of a Gaussian's colour from which it shows
+WRONG = 2.0  # times the charts' usual error beyond which what is drawn in the object's place is none of the surface
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """What is round the object, and where photos show it; tuples are of the masks' views."""
+
+    planes: tuple[Plane, ...]
+    laid: tuple[Laid, ...]  # those of which the object hides something
+    selection: Selection  # without what photos show to be surface
+    objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
+    marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
+    confidence: float
+    reason: str
+
+    def witnesses(self, views: Sequence[ViewState]) -> list[Witness]:
+        return [
+            Witness(v.camera, v.bare, hidden | marked, beside, v.masks.depth_before)
+            for v, (hidden, beside), marked in zip(views, self.objects, self.marked)
+        ]
+
+    def with_marked(self, more: Sequence[np.ndarray]) -> Surfaces:
+        return replace(self, marked=tuple(a | b for a, b in zip(self.marked, more)))
+
+
+def find_surfaces(
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+    settled: bool = True,
+) -> Surfaces:
+    """The planes that run into what the object hid, settled by photos or as they are drawn."""
+    assert settings.charts is not None
+    if all(view.silhouette.all() for view in masks.views):
+        raise IllPosed("the object hides everything in every view: nothing is left to fill from, add views")
+    # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
+    marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
+    objects = tuple(object_pixels(scene, masks.removed, masks.views, settings.clearing))
+    rough = Surfaces((), (), masks.selection, objects, marked, 1.0, "")
+    witnesses = rough.witnesses(views)
+    planes = find_planes(masks.views, witnesses, region, settings.charts, settled)
+    laid = lay_planes(planes, masks.views, witnesses, region, settings.charts)
+    reason = f"{len(planes)} planes run into what the object hid"
+    found = replace(rough, planes=planes, laid=laid, reason=reason)
+    sunk = sunk_rows(scene, masks.selection, laid)
+    if not len(sunk):
+        return found
+
+    def hidden_by(removed: np.ndarray) -> Surfaces:
+        return replace(found, objects=tuple(object_pixels(scene, removed, masks.views, settings.clearing)))
+
+    standing = masks.removed
+    standing[sunk] = False
+    charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
+    selection = with_surface(masks.selection, scene, sunk, charts)
+    reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
+    return replace(hidden_by(selection.removed), selection=selection, reason=reason)
+
+
+@dataclass(frozen=True)
+class Charted:
+    """The surfaces that the object hid, seen straight on, and what follows from them."""
+
+    charts: tuple[Chart, ...]
+    selection: Selection  # with what had to be cleared away
+    targets: Targets
+    confidence: float
+    reason: str
+
+
+def chart_surfaces(
+    scene: Gaussians, region: Region, surfaces: Surfaces, views: Sequence[ViewState], settings: RemovalSettings
+) -> Charted:
+    """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
+    witnesses, marked, masks = surfaces.witnesses(views), surfaces.marked, [v.masks for v in views]
+    charts = draw_charts(surfaces.laid, witnesses, region, marked)
+    if not charts:
+        return Charted((), surfaces.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
+    tolerance, witnesses = max(c.tolerance for c in charts), hiding_rests(witnesses, charts)
+    selection = clear_air(scene, region, surfaces.selection, masks, witnesses, charts, settings.clearing)
+    targets = chart_targets(scene, selection, masks, witnesses, charts, tolerance, marked, settings.clearing)
+    words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
+    cleared = int((selection.removed & ~surfaces.selection.removed).sum())
+    return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the object does to the light round it; in words, why it seems to do nothing."""
+
+    reflection: Reflection | str
+    shadow: Shadow | str
+
+    @property
+    def effects(self) -> list[Reflection | Shadow]:
+        return [f for f in (self.shadow, self.reflection) if not isinstance(f, str)]
+
+    @property
+    def confidence(self) -> float:
+        return min((f.confidence for f in self.effects), default=0.0)
+
+    @property
+    def reason(self) -> str:
+        return "; ".join(f if isinstance(f, str) else f.reason for f in (self.shadow, self.reflection))
+
+
+def find_light(
+    scene: Gaussians,
+    region: Region,
+    surfaces: Surfaces,
+    views: Sequence[ViewState],
+    shadow_masks: Mapping[str, np.ndarray],  # ID → [H, W] bool, the shadow as the user marked it
+    settings: RemovalSettings,
+) -> Found:
+    """Look for the object's reflection, and in photos without that for its shadow."""
+    gone, masks = scene.take(surfaces.selection.removed), [v.masks for v in views]
+    planes = support_first(surfaces.planes, gone)
+    if not planes:
+        none = "no surface is known round the object"
+        return Found(f"no reflection found: {none}", f"no shadow found: {none}")
+    witnesses: Sequence[Witness] = surfaces.witnesses(views)
+    grounds = look_at(planes, masks, witnesses, region)
+    reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
+    if isinstance(reflection, Reflection):
+        bare = bare_photos(reflection, witnesses)
+        witnesses = [replace(w, photo=photo) for w, (photo, *_) in zip(witnesses, bare)]
+        grounds = look_at(planes, masks, witnesses, region)
+    if settings.shadow == "mask":
+        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
+    else:
+        shadow = find_shadow(gone, planes, grounds, region)
+    return Found(reflection, shadow)
+
+
+def undo_light(scene: Gaussians, surfaces: Surfaces, views: Sequence[ViewState], found: Found) -> Lifted:
+    """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
+    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, found.shadow)
+
+
+def with_contact(found: Found, charts: Sequence[Chart]) -> Found:
+    """The same with the shadow where the object touches a surface: where none of a lamp was found."""
+    shadow = find_contact(charts)
+    return replace(found, shadow=f"{found.shadow}; {shadow}" if isinstance(shadow, str) else shadow)
+
+
+@dataclass(frozen=True)
+class Relit:
+    """What the object does to the light round it, undone as far as it is found."""
+
+    found: Found
+    lifted: Lifted | None
+
+    @property
+    def shadow(self) -> dict[str, Any]:
+        """See Shadow.facts."""
+        return _facts(self.found.shadow, NO_SHADOW)
+
+    @property
+    def reflection(self) -> dict[str, Any]:
+        """See Reflection.facts."""
+        return _facts(self.found.reflection, NO_REFLECTION)
+
+    def scene(self, scene: Gaussians) -> Gaussians:
+        """The scene in its new light."""
+        return scene if self.lifted is None else self.lifted.scene(scene)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[M] of the scene, whose light changed."""
+        return np.zeros(0, int) if self.lifted is None else self.lifted.rows
+
+    def views(self, views: Sequence[ViewState]) -> tuple[ViewState, ...]:
+        """The views in it."""
+        if self.lifted is None:
+            return tuple(views)
+        return tuple(replace(v, bare=photo, painted=photo) for v, photo in zip(views, self.lifted.photos))
+
+    def shaded(self, number: int) -> np.ndarray | bool:
+        """[H, W] bool: where a view, by its index, changed."""
+        return False if self.lifted is None else self.lifted.shaded[number]
+
+
+def _facts(found: Reflection | Shadow | str, none: dict[str, Any]) -> dict[str, Any]:
+    """For the summary."""
+    return {**none, "reason": found} if isinstance(found, str) else {**found.facts(), "reason": found.reason}
+
+
+NOT_LIT = Relit(Found("not looked for", "not looked for"), None)
+
+
+@dataclass(frozen=True)
+class Relearned:
+    """Gaussians round the object, as photos teach them."""
+
+    rows: np.ndarray  # [M] of the scene
+    gaussians: Gaussians  # [M], their new values
+    confidence: float
+    reason: str
+
+    def scene(self, scene: Gaussians) -> Gaussians:
+        """The scene with them."""
+        arrays = {name: getattr(scene, name).copy() for name in LEARNED}
+        for name in LEARNED:
+            arrays[name][self.rows] = getattr(self.gaussians, name)
+        return replace(scene, **arrays)
+
+
+def relearn(
+    scene: Gaussians,
+    region: Region,
+    removed: np.ndarray,  # [N] bool
+    views: Sequence[ViewState],
+    charts: Sequence[Chart],
+    settings: RemovalSettings,
+    progress: Progress,
+) -> Relearned:
+    """Fit colours and opacity of what draws the object's place to the photos round it, and to the charts inside.
+
+    Inside, charts teach only what cannot be true: a Gaussian that nobody saw there may draw anything, but where it
+    draws about what charts show, a photo of its own place knows better than a chart's mosaic.
+    """
+    kept = scene.take(~removed)
+    showing = looked_at([v for v in views if v.masks.silhouette.any()], settings.refine)
+    near = kept.usable & near_region(kept, region, 1.0) & (kept.scales.max(1) < LARGEST * extent(region))
+    near &= np.isfinite(kept.opacity_logits)  # infinite ones are legal, and have no slope
+
+    def weights(view: ViewState) -> np.ndarray:
+        labels = np.where(view.masks.silhouette, PLACE, ELSEWHERE).astype(np.uint8)
+        return label_weights(kept, view.camera, labels, ELSEWHERE, near)
+
+    place, elsewhere = total_over(showing, weights, (2, len(kept)))
+    learns = near & (place > SHOWN) & (place > SHARE * (place + elsewhere))
+    observations = [observed_round(v, charts) for v in emptied(kept, showing)]
+    how = settings.refine, settings.random_seed, lambda _, *step: progress("relearn", *step), LEARNED, ROUND
+    refined = refine_gaussians(kept.take(~learns), kept.take(learns), observations, *how)
+    rows = np.flatnonzero(~removed)[learns] if refined.steps else np.zeros(0, int)
+    reason = f"{len(rows)} Gaussians round the object: {refined.reason}"
+    return Relearned(rows, refined.gaussians.take(np.arange(len(rows))), refined.confidence, reason)
+
+
+def take_painted_colours(kept: Gaussians, added: Gaussians, views: Sequence[ViewState]) -> Relearned:
+    """The kept Gaussians that show where views are painted, in colours by which the filled scene shows what is painted.
+
+    What they show elsewhere holds them.
+    """
+    wanted = [np.isin(v.rules, OWN_RULES) for v in views if v.rules is not None]
+    views = [v for v in views if v.rules is not None]
+    hidden = [(v.masks.silhouette | v.masks.target) & ~own for v, own in zip(views, wanted)]
+    witnesses = [Witness(v.camera, v.painted, h, np.zeros_like(h), v.masks.depth_before) for v, h in zip(views, hidden)]
+    whole, painted = kept.extended(added), [v.painted for v in views]
+    may = (np.arange(len(whole)) < len(kept)) & whole.usable & np.isfinite(whole.opacity_logits)
+    rows, sh = recoloured(whole, np.zeros(len(whole), bool), witnesses, painted, wanted, wanted, 0, may)
+    seen = np.abs(sh[:, 0] - kept.sh[rows, 0]).max(1) > VISIBLE / SH_C0
+    rows, sh = rows[seen], sh[seen]
+    reason = f"{len(rows)} Gaussians before the new ones take the colours that are painted there"
+    return Relearned(rows, replace(kept.take(rows), sh=sh), 1.0, reason)
+
+
+def observed_round(view: ViewState, charts: Sequence[Chart]) -> Observation:
+    """What a view teaches of the object's surroundings; it is painted with the emptied scene in the object's place."""
+    place = view.masks.silhouette | view.masks.target
+    image, weight = view.painted, np.zeros(place.shape, np.float32)
+    if view.hits is not None:
+        shown, known, hole = pictured(charts, view.hits)
+        tolerance = max(c.tolerance for c in charts)
+        known &= ~hole & ~view.hits.behind(view.masks.depth_after, tolerance)
+        was, taught = (cv2.GaussianBlur(p.astype(np.float32), (0, 0), SMOOTHING) for p in (image, shown))
+        off = np.sqrt(((was - taught) ** 2).mean(-1))
+        beside = known & ~place
+        if beside.any():
+            wrong = known & place & ~view.masks.target & (off > WRONG * np.sqrt((off[beside] ** 2).mean()))
+            image = np.where(wrong[..., None], shown, image)
+            weight[wrong] = 1
+    return Observation(view.camera, image, place, weight)
