@@ -16,7 +16,7 @@ from ..raster import surface_depth
 from ..stages.charts import CHART, Chart
 from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
-from ..stages.seed import colour_gaussians, seed_gaussians, settle_gaussians
+from ..stages.seed import seed_gaussians, settle_gaussians
 from ..view_state import ViewState
 from .completion import Completed
 
@@ -88,9 +88,8 @@ def settle_seeds(
     settings: RemovalSettings,
 ) -> Gaussians:
     """The seeds that are needed, in the colours of the painted views."""
-    camera, cameras = completed.camera, [v.camera for v in views]
-    coloured = colour_gaussians(seeds, camera, cameras, painting.views, filled.sh_degree, settings.seed)
-    return settle_gaussians(filled, coloured, camera, cameras, painting.views, settings.seed)
+    cameras = [v.camera for v in views]
+    return settle_gaussians(filled, seeds, completed.camera, cameras, painting.views, settings.seed)
 
 
 def snapped(
