@@ -7,7 +7,7 @@ are differences between neighbours, coarse and fine, robustly, as edges of textu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -54,19 +54,14 @@ class Shading:
         A light nearby makes that, and it is no shadow. But wide shadows of the sky look like it: to measure those,
         light must not be bent.
         """
-        operators, besides, groups = [], [], []
-        for number, surface in enumerate(surfaces):
-            operator, group = _differences(surface.shown, levels)
-            operators.append(operator)
-            groups.append(group + 1000 * number)
-            besides.append(_besides(surface, bent))
+        operators, groups = zip(*(_differences(s.shown, levels) for s in surfaces))
         operator = sparse.block_diag(operators).tocsr()
-        group = np.concatenate(groups)
+        group = np.concatenate([group + 1000 * number for number, group in enumerate(groups)])
         colours = np.concatenate([s.colours[s.shown] for s in surfaces])
         luminance = np.log(np.exp(colours).mean(1))
         observed = operator @ luminance
         hues = operator @ colours - observed[:, None]
-        other = operator @ scipy.linalg.block_diag(*besides)
+        other = operator @ scipy.linalg.block_diag(*(_besides(s, bent) for s in surfaces))
         noise = _usual(observed - other @ _explained(observed, other, group), group)
         colourful = np.abs(hues).max(1)
         weight = 1 / (1 + (colourful / (CHROMA * _usual(colourful, group))) ** 2)
@@ -75,18 +70,14 @@ class Shading:
         other = scipy.linalg.solve_triangular(root, other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
-    def fit(
-        self,
-        shadows: np.ndarray,  # [T, S]
-        least: np.ndarray | float = 0.0,  # [S] of strengths
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Strengths of shadows, coefficients of what is besides [B], and the loss that is left.
+    def fit(self, shadows: np.ndarray, least: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Strengths [S] of shadows [T, S], no less than `least`, and coefficients of what is besides [B].
 
-        Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
+        They minimise Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
         count, shadows = shadows.shape[1], shadows.astype(np.float64)
-        x = np.concatenate([np.zeros(count), self.besides.T @ (self.weight * self.observed / self.noise**2)])
-        x[:count] = least
+        even = self.besides.T @ (self.weight * self.observed / self.noise**2)
+        x = np.concatenate([np.zeros(count) + least, even])
         low = np.concatenate([x[:count], np.full(len(x) - count, -np.inf)])
         high = np.where(np.isfinite(low), 1.0, np.inf)
         loss = self.loss(self.residual(shadows @ x[:count], x[count:]))
@@ -111,7 +102,7 @@ class Shading:
                 x, loss = np.clip(tried, low, high), after
             if gained <= ENOUGH * loss:
                 break
-        return x[:count], x[count:], loss
+        return x[:count], x[count:]
 
     def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """[S, 3] by what strengths [S] of shadows [T, S] differ between the channels: their mean is about 1."""
@@ -151,10 +142,6 @@ class Shading:
         before = self.observed - self.besides @ coefficients
         squares = [(self.weight * there * d**2).sum() for d in (before - made, before)]
         return float(np.clip(1 - squares[0] / max(squares[1], 1e-12), 0, 1))
-
-    def only(self, rows: np.ndarray) -> Shading:
-        """With only these differences [K] bool counted."""
-        return replace(self, weight=self.weight * rows)
 
     def changes(self, shadows: np.ndarray) -> np.ndarray:
         """[K, S] float32: how differences change, about, with the strength of shadows [T, S]."""

@@ -17,7 +17,7 @@ from .charts.hits import Hits, first_hits, pictured
 from .ground import Ground
 from .recolour import recoloured
 from .reflection import VISIBLE, Reflection
-from .shadow import UNTOUCHED, Shadow
+from .shadow import MIXED, UNTOUCHED, Shadow
 from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
@@ -29,7 +29,6 @@ BRIGHTER = (
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
-MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
 
 
 @dataclass(frozen=True)

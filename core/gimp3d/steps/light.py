@@ -12,13 +12,12 @@ from ..box import Region
 from ..gaussians import Gaussians
 from ..presets import RemovalSettings
 from ..stages.charts import Chart
-from ..stages.contact import find_contact
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift_shadow, subtract_reflection
 from ..stages.masks import Masks
 from ..stages.occluder import support_first
 from ..stages.reflection import Reflection, find_reflection
-from ..stages.shadow import Shadow, find_shadow, marked_shadow
+from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
 from ..stages.witness import Witness
 from ..view_state import ViewState
 from .surfaces import Surfaces
@@ -81,7 +80,7 @@ def find_light(
     if settings.shadow == "mask":
         shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
     else:
-        shadow = find_shadow(gone, planes, grounds, region)
+        shadow = find_shadow(gone, planes[0], grounds, region)
     return Found.of(reflection, shadow)
 
 
