@@ -122,7 +122,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),
-    "dark rims where it stands stay": (("gimp3d.stages.contact:CHANCE", math.inf),),
+    "dark rims where it stands stay": (("gimp3d.stages.shadow:CHANCE", math.inf),),
     "a light need not beat chance": (("gimp3d.stages.light_search:EARNS", 1e-9),),
     "a light need not explain what is uneven": (("gimp3d.stages.light_search:FITS", 1e-9),),
     "a shadow may be missing round the object": (("gimp3d.stages.shadow:FAINT", -1.0),),

@@ -12,7 +12,7 @@ from .box import Region
 from .gaussians import Gaussians
 from .run import Run
 from .stages.charts import Chart
-from .stages.exposure import exposures_of
+from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks
 from .steps.behind import (
     NOT_LIT,
@@ -63,8 +63,8 @@ def look_behind(
 ) -> Behind:
     """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
     settings, region, lit = run.settings, masks.grown(region), NOT_LIT
-    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos)
-    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views))
+    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos, words=levelled)
+    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures))
     if settings.charts is None or masks.mode != "need":
         return Behind(scene, scene, lit.rows, masks, views, (), lit)
     inputs = scene, region, masks, views, settings

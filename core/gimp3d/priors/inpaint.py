@@ -118,7 +118,9 @@ def exemplar(view: Unfinished) -> Appearance:
     patch = PATCHES[view.variant % len(PATCHES)]
     filled, misfit = complete_picture(view.image[near], view.hole[near], patch, view.seed + view.variant, unknown)
     if np.isnan(misfit):
-        return Appearance(interpolated(view.image, view.hole), 0.1, "no patch of the reference lies off the hole: interpolated")
+        return Appearance(
+            interpolated(view.image, view.hole), 0.1, "no patch of the reference lies off the hole: interpolated"
+        )
     confidence = 0.7 * float(np.exp(-misfit / CONFIDENCE_SCALE))
     whole = view.image.copy()
     whole[near] = filled

@@ -7,7 +7,7 @@ are differences between neighbours, coarse and fine, robustly, as edges of textu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -68,10 +68,10 @@ class Shading:
         other = scipy.linalg.solve_triangular(root, other.T, trans="T").T  # orthogonal
         return cls(operator, observed, other, noise, weight, hues)
 
-    def fit(self, shadows: np.ndarray, least: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray, float]:
-        """Strengths [S], no less than the least, of shadows [T, S]; coefficients of what is besides [B]; the loss left.
+    def fit(self, shadows: np.ndarray, least: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Strengths [S] of shadows [T, S], no less than `least`, and coefficients of what is besides [B].
 
-        Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
+        They minimise Σ weight (√(1 + u²) − 1), u the residual over its noise; luminance is 1 − Σ strength · shadow.
         """
         count, shadows = shadows.shape[1], shadows.astype(np.float64)
         x = np.concatenate([np.full(count, least), self.besides.T @ (self.weight * self.observed / self.noise**2)])
@@ -99,7 +99,7 @@ class Shading:
                 x, loss = np.clip(tried, low, high), after
             if gained <= ENOUGH * loss:
                 break
-        return x[:count], x[count:], loss
+        return x[:count], x[count:]
 
     def tints(self, shadows: np.ndarray, strengths: np.ndarray) -> np.ndarray:
         """[S, 3] by what strengths [S] of shadows [T, S] differ between the channels: their mean is about 1."""
@@ -139,10 +139,6 @@ class Shading:
         before = self.observed - self.besides @ coefficients
         squares = [(self.weight * there * d**2).sum() for d in (before - made, before)]
         return float(np.clip(1 - squares[0] / max(squares[1], 1e-12), 0, 1))
-
-    def only(self, rows: np.ndarray) -> Shading:
-        """With only these differences [K] bool counted."""
-        return replace(self, weight=self.weight * rows)
 
     def changes(self, shadows: np.ndarray) -> np.ndarray:
         """[K, S] float32: how differences change, about, with the strength of shadows [T, S]."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 import scipy.ndimage
 
 from ..errors import IllPosed
+from ..geometry import disparity_of
 from ..priors.monodepth import DepthPrior, relative_disparity
 from ..schema import Signed
 from ..solvers.poisson import solve_poisson
@@ -50,6 +51,11 @@ class DepthCompletion:
     fit: PriorFit  # how the prior was scaled, if there is one
     clamped: int = 0  # pixels whose disparity had to be clamped
 
+    @classmethod
+    def of(cls, disparity: np.ndarray, *rest: Any) -> DepthCompletion:
+        disparity = disparity.astype(np.float32)
+        return cls(disparity, disparity_of(disparity), *rest)
+
 
 def complete_depth(
     disparity: np.ndarray,  # [H, W] float32, 1/z of the view without the object; 0 = infinitely far (sky)
@@ -75,7 +81,7 @@ def complete_depth(
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
-        return _completion(scene, 1.0, "nothing to fill", PriorFit(), 0)
+        return DepthCompletion.of(scene, 1.0, "nothing to fill", PriorFit())
     ring = trusted & (cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5) <= RING)
     around, fit, guide = ring if ring.any() else trusted, PriorFit(), None
     if prior is not None:
@@ -84,7 +90,8 @@ def complete_depth(
     if guide is not None and fit.scale:
         gaps = ~np.isfinite(guide)
         whole = fit.shift + fit.scale * solve_poisson(gaps, ~gaps, guide).values
-        filled = solve_poisson(hole, trusted & fit.agrees(guide, scene), scene, whole).values
+        agrees = np.nan_to_num(np.abs(fit.line[0] * guide + fit.line[1] - scene)) <= fit.error  # or says nothing
+        filled = solve_poisson(hole, trusted & agrees, scene, whole).values
         confidence, reason = fit.confidence, ""
     elif not ring.any():
         raise IllPosed("depth: the hole has no rim of known depth; choose a reference that shows more surroundings")
@@ -110,7 +117,7 @@ def complete_depth(
     if unknown.sum() > LARGE * hole.sum():
         confidence *= 0.3
     result = np.where(hole, np.clip(filled, low, high), scene)
-    return _completion(result, confidence, "; ".join(reasons), fit, clamped)
+    return DepthCompletion.of(result, confidence, "; ".join(reasons), fit, clamped)
 
 
 def _continued(scene: np.ndarray, ring: np.ndarray, hole: np.ndarray, surface: str) -> tuple[np.ndarray, str]:
@@ -121,10 +128,8 @@ def _continued(scene: np.ndarray, ring: np.ndarray, hole: np.ndarray, surface: s
         here = np.stack([rows, cols, np.ones(len(rows))], -1)
         (a, b, c), _ = robust_fit(here / scene[ground][:, None], np.ones(len(rows)))
         v, u = np.indices(scene.shape)
-        filled, words = (
-            np.where(ring | hole, a * v + b * u + c, np.nan),
-            "planar: the plane that most of the ring lies on",
-        )
+        filled = np.where(ring | hole, a * v + b * u + c, np.nan)
+        words = "planar: the plane that most of the ring lies on"
     elif surface == "harmonic" or not ground.any():
         filled, words = solve_poisson(hole, ground if ground.any() else ring, scene).values, "harmonic"
     else:
@@ -134,12 +139,6 @@ def _continued(scene: np.ndarray, ring: np.ndarray, hole: np.ndarray, surface: s
         sky = solve_poisson(hole, ring, (~ground).astype(float)).values
         filled = np.where(hole & (sky > 0.5), 0.0, filled)
     return filled, words
-
-
-def _completion(disparity: np.ndarray, confidence: float, reason: str, fit: PriorFit, clamped: int) -> DepthCompletion:
-    disparity = disparity.astype(np.float32)
-    depth = np.divide(1, disparity, out=np.zeros_like(disparity), where=disparity > 0)
-    return DepthCompletion(disparity, depth, confidence, reason, fit, clamped)
 
 
 @dataclass(frozen=True)
@@ -154,20 +153,12 @@ class PriorFit:
     line: tuple[float, float] = (0.0, 0.0)  # (slope, offset) fitted to `ring`
     error: float = float("inf")  # in disparity, beyond which a pixel is not on the line
 
-    def agrees(self, prior: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """Bool, of any shape: what lies on the line, or what the prior says nothing of."""
-        with np.errstate(invalid="ignore"):
-            return ~(np.abs(self.line[0] * prior + self.line[1] - disparity) > self.error)
-
 
 def fit_prior(
-    disparity: np.ndarray,  # [H, W]
-    around: np.ndarray,  # [H, W] bool, pixels round the hole whose disparity is known
-    hole: np.ndarray,  # [H, W] bool
-    prior: np.ndarray,  # [H, W] relative disparity, NaN = no value
-    scale_factor: float | None = None,  # s_f, if it is not to be measured
+    disparity: np.ndarray, around: np.ndarray, hole: np.ndarray, prior: np.ndarray, scale_factor: float | None = None
 ) -> PriorFit:
-    """Measure s_f by a robust affine fit of the scene's disparity to the prior round the hole (docs/method.md).
+    """Measure s_f by a robust affine fit of the scene's disparity to the prior round the hole (docs/method.md), unless
+    it is given. Maps are [H, W]: `around` bool, where disparity is known round the hole; NaN is no value of a prior.
 
     The fit tells the prior's units. Whether to follow it into the hole is another question: what a plane tells as well
     needs no prior. It is believed as far as its relief on the ring is the scene's, or as far as its relief in the hole
@@ -186,9 +177,8 @@ def fit_prior(
 
     if scale_factor is not None:
         shift = float(np.median(d - scale_factor * m))
-        return PriorFit(
-            scale_factor, shift, 0.5, f"guided, s_f = {scale_factor:g} as set", shown, (scale_factor, shift)
-        )
+        words, line = f"guided, s_f = {scale_factor:g} as set", (scale_factor, shift)
+        return PriorFit(scale_factor, shift, 0.5, words, shown, line)
     middle, spread = m.mean(), m.std()
     if spread < 1e-6 * max(float(np.abs(m).max()), 1e-150):
         return unused((0.0, float(np.median(d))), "it is constant round the hole")

@@ -37,25 +37,20 @@ class Exposure:
         return np.where(changed[..., None], _times(picture, self.gain), photo)
 
 
-@dataclass(frozen=True)
-class Exposures:
-    """Every view's, in the views' order."""
-
-    views: tuple[Exposure, ...]
-    confidence: float
-    reason: str
-
-
-def exposures_of(kept: Gaussians, views: Sequence[ViewMasks], photos: Mapping[str, np.ndarray]) -> Exposures:
+def exposures_of(kept: Gaussians, views: Sequence[ViewMasks], photos: Mapping[str, np.ndarray]) -> tuple[Exposure, ...]:
     """Compare photos (by ID, [H, W, 3] uint8) with the splats round the object; `kept` is the scene without it."""
 
     def compare(view: ViewMasks) -> Exposure:
         ring = exposure_ring(view)
         return level_exposure(ring, photos[view.camera.id], render_bytes(kept, view.camera, pixels=ring))
 
-    found = tuple(parallel_map(compare, views))
-    levelled = sum(bool((e.gain != 1).any()) for e in found)
-    return Exposures(found, 1.0, f"{levelled} of {len(found)} photos are brought to the splats' exposure")
+    return tuple(parallel_map(compare, views))
+
+
+def levelled(found: Sequence[Exposure]) -> tuple[float, str]:
+    """The words of the stage that compares."""
+    count = sum(bool((e.gain != 1).any()) for e in found)
+    return 1.0, f"{count} of {len(found)} photos are brought to the splats' exposure"
 
 
 def exposure_ring(view: ViewMasks) -> np.ndarray:
@@ -69,24 +64,16 @@ def exposure_ring(view: ViewMasks) -> np.ndarray:
 
 
 def level_exposure(ring: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> Exposure:
-    """A photo's [H, W, 3] gain over the splats, as `drawn` without the object, in the ring round that
-    (`exposure_ring`), if dividing by it clearly fits better.
-    """
-    unchanged = Exposure(np.ones(3))
-    gain = exposure_gain(drawn[ring], photo[ring])
-    if (gain > MAX_GAIN).any() or (gain < 1 / MAX_GAIN).any():
+    """A photo's [H, W, 3] gain over the splats, as `drawn`, in a ring (see above), if that clearly fits better."""
+    gain, unchanged = exposure_gain(drawn[ring], photo[ring]), Exposure(np.ones(3))
+    if (gain == 1).all() or (gain > MAX_GAIN).any() or (gain < 1 / MAX_GAIN).any():
         return unchanged
-    level = _times(photo[ring], 1 / gain)
-    if _difference(level, drawn[ring]) < CLEARLY * _difference(photo[ring], drawn[ring]) - MARGIN:
-        return Exposure(gain)
-    return unchanged
 
+    def off(colours: np.ndarray) -> float:
+        return float(np.minimum(np.abs(colours.astype(np.float32) - drawn[ring]), GROSS).mean())
 
-def _difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean absolute difference [N, 3] in grey levels; 0 of nothing."""
-    if len(a) == 0:
-        return 0.0
-    return float(np.minimum(np.abs(a.astype(np.float32) - b), GROSS).mean())
+    clearly = off(_times(photo[ring], 1 / gain)) < CLEARLY * off(photo[ring]) - MARGIN
+    return Exposure(gain) if clearly else unchanged
 
 
 def _times(picture: np.ndarray, gain: np.ndarray) -> np.ndarray:

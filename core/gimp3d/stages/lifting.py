@@ -20,7 +20,7 @@ from .charts.plane import Hits, first_hits, pictured
 from .ground import Ground
 from .reflection import VISIBLE, Reflection
 from .seed import missing_colours
-from .shadow import UNTOUCHED, Shadow
+from .shadow import MIXED, UNTOUCHED, Shadow
 from .witness import Witness
 
 STRIDE = 4  # px between those that are asked first
@@ -30,7 +30,6 @@ BRIGHTER = 8.0  # grey levels by which lifted ground may be brighter than lit: e
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
 UNRELIABLE = 0.1  # share of the ground that is drawn clearly nearer than it is, from which depths tell nothing
-MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
 LOOKS = 12  # views by which colours are corrected
 CORRECTIONS, HOLD = 10, 0.03  # steps of least squares, and px of blend weight by which the old colours are held
 SHOWN = 0.5  # px of blend weight by which photos show a Gaussian

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -48,15 +50,17 @@ class Light:
         """Degrees above the support."""
         return math.degrees(math.asin(float(np.clip(self.towards[2], -1, 1))))
 
-    def direction(self, plane: Plane) -> np.ndarray:
-        """[3] unit, scene coordinates, towards the light."""
-        return self.towards @ plane.axes
-
-    def azimuth(self, plane: Plane) -> float:
-        """Degrees from the scene's x axis towards y (where the support is level in z; y to z, or z to x, else)."""
-        up = int(np.argmax(np.abs(plane.normal)))
-        direction = self.direction(plane)
-        return math.degrees(math.atan2(direction[(up + 2) % 3], direction[(up + 1) % 3]))
+    def facts(self, plane: Plane) -> dict[str, Any]:
+        """For the summary: degrees, the direction in scene coordinates, the azimuth from the scene's x axis towards y
+        (where the plane is level in z; y to z, or z to x, else), strengths in shares of light."""
+        up, towards = int(np.argmax(np.abs(plane.normal))), self.towards @ plane.axes
+        return {
+            "elevation": round(self.elevation, 2),
+            "azimuth": round(math.degrees(math.atan2(towards[(up + 2) % 3], towards[(up + 1) % 3])), 2),
+            "softness": round(self.softness, 2),
+            "direction": [round(float(x), 4) for x in towards],
+            "strength": [round(float(x), 3) for x in self.strength],
+        }
 
     def rays(self, count: int = SAMPLES) -> np.ndarray:
         """[count, 3] directions, evenly drawn from the lobe (a sunflower's seeds)."""
@@ -81,66 +85,35 @@ def taken_from(
 
 
 @dataclass(frozen=True)
-class Receiver:
+class Receiver(LitSurface):
     """A surface that a shadow may fall on, to be told from its colours."""
 
-    surface: LitSurface
-    points: np.ndarray  # [T, 3] of its known texels
+    places: np.ndarray  # [H, W, 3] of its texels
     normal: np.ndarray  # [3]
 
     @classmethod
     def make(cls, ground: Ground) -> Receiver:
-        surface = LitSurface(ground.known, np.log(linear(ground.image) + DARK))
-        return cls(surface, ground.points()[ground.known], ground.plane.normal)
+        return cls(ground.known, np.log(linear(ground.image) + DARK), ground.points(), ground.plane.normal)
+
+    @property
+    def points(self) -> np.ndarray:
+        """[T, 3] of known texels."""
+        return self.places[self.shown]
 
     def halved(self) -> Receiver:
         """Blocks of four texels, where half of them are known."""
-        h, w = (2 * (n // 2) for n in self.surface.shown.shape)
-        shown = self.surface.shown[:h, :w]
-        points = np.zeros((*self.surface.shown.shape, 3))
-        points[self.surface.shown] = self.points
+        h, w = (n // 2 for n in self.shown.shape)
+        shown = self.shown[: 2 * h, : 2 * w]
 
         def blocks(values: np.ndarray) -> np.ndarray:
-            return values[:h, :w].reshape(h // 2, 2, w // 2, 2, -1).sum((1, 3))
+            return values.reshape(h, 2, w, 2, -1).sum((1, 3))
 
         count = blocks(shown)
-        known = count[..., 0] >= 2
-        colours, points = (
-            blocks(np.where(shown[..., None], v[:h, :w], 0)) / np.maximum(count, 1)
-            for v in (self.surface.colours, points)
+        colours, places = (
+            blocks(np.where(shown[..., None], v[: 2 * h, : 2 * w], 0)) / np.maximum(count, 1)
+            for v in (self.colours, self.places)
         )
-        return replace(self, surface=LitSurface(known, colours), points=points[known])
-
-
-@dataclass(frozen=True)
-class _Sky:
-    """Candidates for lights: lobes of several widths, in the support's axes."""
-
-    rays: np.ndarray  # [D, 3]
-    lobes: np.ndarray  # [D, A] float32, what share of a lobe each ray is
-    towards: np.ndarray  # [A, 3]
-    softness: np.ndarray  # [A] degrees
-
-    @classmethod
-    def make(cls) -> _Sky:
-        rays = _hemisphere(DIRECTIONS)
-        lobes, towards, softness = [], [], []
-        for width, count in zip(SOFTNESS, LOBES):
-            middle = _hemisphere(count)
-            apart = np.degrees(np.arccos(np.clip(rays @ middle.T, -1, 1)))
-            lobe = np.exp(-0.5 * (apart / width) ** 2)
-            lobes.append(lobe / lobe.sum(0))
-            towards.append(middle)
-            softness.append(np.full(count, width))
-        return cls(rays, np.concatenate(lobes, 1).astype(np.float32), np.concatenate(towards), np.concatenate(softness))
-
-    def cast(self, occluder: Occluder, receivers: Sequence[Receiver]) -> np.ndarray:
-        """[T, A] float32: the share of each lobe that the object keeps from every texel."""
-
-        def of(r: Receiver) -> np.ndarray:
-            return occluder.blocked(r.points, self.rays) * _faces(occluder.plane, r.normal, self.rays)
-
-        return np.concatenate([of(r) @ self.lobes for r in receivers])
+        return replace(self, shown=count[..., 0] >= 2, colours=colours, places=places)
 
 
 @dataclass(frozen=True)
@@ -162,18 +135,15 @@ class Scenery:
 
     occluder: Occluder
     receivers: Sequence[Receiver]
-    lit: Shading
 
-    @classmethod
-    def make(cls, occluder: Occluder, receivers: Sequence[Receiver]) -> Scenery:
-        return cls(occluder, receivers, Shading.make([r.surface for r in receivers], LEVELS))
-
-    def cast(self, light: Light) -> np.ndarray:
-        """[T] the share of its light that does not arrive."""
-        return np.concatenate([_cast(self.occluder, r.points, r.normal, light) for r in self.receivers])
+    @cached_property
+    def lit(self) -> Shading:
+        return Shading.make(self.receivers, LEVELS)
 
     def casts(self, lights: Sequence[Light]) -> np.ndarray:
-        return np.stack([self.cast(light) for light in lights], 1)
+        """[T, L] the share of each light that does not arrive."""
+        parts = [[_cast(self.occluder, r.points, r.normal, light) for r in self.receivers] for light in lights]
+        return np.stack([np.concatenate(p) for p in parts], 1)
 
     def settled(self, lights: Sequence[Light], others: Sequence[Light], finest: float) -> list[Light]:
         """Directions and softness, precisely: a pattern search, each light for what the rest does not explain."""
@@ -182,7 +152,7 @@ class Scenery:
         step, rounds = COARSEST, 0
         while step >= finest:
             moved, rounds = False, rounds + 1
-            strength, besides, _ = lit.fit(shadows)
+            strength, besides = lit.fit(shadows)
             for k in range(len(lights)):
                 rest = np.delete(shadows, k, axis=1) @ np.delete(strength, k)
                 tries = [lights[k], *_near(lights[k], step)]
@@ -201,16 +171,16 @@ class Scenery:
         """
         lit, shadows = self.lit, self.casts(lights)
         changes = lit.changes(shadows)
-        strength, besides, _ = lit.fit(shadows)
+        strength, besides = lit.fit(shadows)
         left = lit.residual(shadows @ strength, besides)
         chance = max(float(lit.gains(bright[0], left).max()), *(float(lit.gains(b, -left).max()) for b in bright))
         found = []
         for k in range(len(lights)):
             others = np.delete(shadows, k, axis=1)
-            rest, besides, _ = lit.fit(others)
+            rest, besides = lit.fit(others)
             without = lit.residual(others @ rest, besides)
             gain = float(lit.gains(changes[:, [k]], without)[0]) if strength[k] > FAINT else 0.0
-            there = lit.only(np.abs(changes[:, k]) * strength[k] > TOLD * lit.noise)
+            there = replace(lit, weight=lit.weight * (np.abs(changes[:, k]) * strength[k] > TOLD * lit.noise))
             before, after, usual = there.loss(without), there.loss(left), there.usual_loss
             share = float(np.clip((before - after) / max(before - usual, 1e-12), 0, 1))
             # lights that take more than all light are none
@@ -220,18 +190,23 @@ class Scenery:
 
 def search(scenery: Scenery) -> tuple[list[Light], Told]:
     """The lights, and what speaks for the weakest; or for the best candidate, if there is none."""
-    lit, sky = scenery.lit, _Sky.make()
-    shadows = sky.cast(scenery.occluder, scenery.receivers)
+    lit, (rays, shares, lobes) = scenery.lit, _candidates()
+
+    def cast(by: Occluder) -> np.ndarray:
+        """[T, A] float32: the share of each lobe that the object keeps from every texel."""
+        kept = (by.blocked(r.points, rays) * _faces(by.plane, r.normal, rays) for r in scenery.receivers)
+        return np.concatenate([share @ shares for share in kept])
+
+    shadows = cast(scenery.occluder)
     own = lit.changes(shadows)
     moved = [scenery.occluder.moved(x, y) for x, y in places_elsewhere(float(max(scenery.occluder.size[:2])))]
-    bright = [own, *(lit.changes(sky.cast(m, scenery.receivers)) for m in moved)]
+    bright = [own, *(lit.changes(cast(m)) for m in moved)]
     found: list[int] = []
     for _ in range(MOST):
-        strength, besides, _ = lit.fit(shadows[:, found])
+        strength, besides = lit.fit(shadows[:, found])
         residual = lit.residual(shadows[:, found] @ strength, besides)
         found.append(int(lit.gains(own, residual).argmax()))
-    lights = [Light(sky.towards[k], float(sky.softness[k]), np.ones(3)) for k in found]
-    settled = False
+    lights, settled = [lobes[k] for k in found], False
     while True:
         told = scenery.told(lights, bright)
         scores = [t.enough if settled else t.over_chance for t in told]
@@ -248,6 +223,18 @@ def search(scenery: Scenery) -> tuple[list[Light], Told]:
             lights = scenery.settled(lights, [], COARSEST / 2)
 
 
+def _candidates() -> tuple[np.ndarray, np.ndarray, list[Light]]:
+    """Rays [D, 3], what share of a lobe each of them is [D, A] float32, and the lobes: of several widths."""
+    rays, shares, lobes = _hemisphere(DIRECTIONS), [], list[Light]()
+    for width, count in zip(SOFTNESS, LOBES):
+        middle = _hemisphere(count)
+        apart = np.degrees(np.arccos(np.clip(rays @ middle.T, -1, 1)))
+        lobe = np.exp(-0.5 * (apart / width) ** 2)
+        shares.append(lobe / lobe.sum(0))
+        lobes += [Light(towards, width, np.ones(3)) for towards in middle]
+    return rays, np.concatenate(shares, 1).astype(np.float32), lobes
+
+
 def places_elsewhere(width: float) -> list[tuple[float, float]]:
     """Ways along the plane to where an object of some width might as well stand."""
     around = [2 * math.pi * k / ELSEWHERE for k in range(ELSEWHERE)]
@@ -258,8 +245,8 @@ def _near(light: Light, step: float) -> list[Light]:
     """Lights a step aside, softer and harder."""
     a, b = _across(light.towards)
     found = []
-    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        towards = light.towards + math.tan(math.radians(step)) * (x * a + y * b)
+    for way in (a, -a, b, -b):
+        towards = light.towards + math.tan(math.radians(step)) * way
         towards /= np.linalg.norm(towards)
         if towards[2] > math.sin(math.radians(LOWEST)):
             found.append(replace(light, towards=towards))

@@ -15,7 +15,7 @@ from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import bounds, dilated
 from ..progress import Progress, silent
-from ..raster import Gradients, PictureGradients, PixelRegion, Rendering, pixel_region
+from ..raster import Gradients, PictureGradients, Rendering, pixel_region
 from ..schema import AtLeastOne, Between
 from .propagate import Rule
 
@@ -50,6 +50,10 @@ class Observation:
     image: np.ndarray  # [H, W, 3] uint8
     target: np.ndarray  # [H, W] bool, what was painted
     weight: np.ndarray  # [H, W] float32 ≥ 0, how far each pixel is trusted
+
+    def counting(self, margin: int) -> np.ndarray:
+        """[H, W] float32, how far pixels count: the target as it is trusted; round it the photo itself counts fully."""
+        return np.where(self.target, self.weight, dilated(self.target, margin)).astype(np.float32)
 
 
 def observed(camera: Camera, image: np.ndarray, rules: np.ndarray) -> Observation:
@@ -90,7 +94,7 @@ def refine_gaussians(
     Every HELD_OUT-th view is left out of the gradient. The state that it likes best is kept, so the result is never
     worse there than the start. Without steps, views or new Gaussians the input is returned.
     """
-    seen = looked_at([o for o in observations if _counting(o, margin).any()], settings)
+    seen = looked_at([o for o in observations if o.counting(margin).any()], settings)
     if settings.steps == 0 or not len(new) or not seen:
         return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
     views = parallel_map(lambda o: _View(frozen, o, margin), seen)
@@ -100,12 +104,10 @@ def refine_gaussians(
     rng = np.random.default_rng(seed)
 
     def judged() -> float:
-        active = state.gaussians
-        return float(np.mean(parallel_map(lambda v: v.loss(active), judges)))
+        return float(np.mean(parallel_map(lambda v: v.loss(state.gaussians), judges)))
 
     before = best = judged()
-    kept, kept_step, waited = new, 0, 0
-    order: list[int] = []
+    kept, kept_step, waited, order = new, 0, 0, list[int]()
     for step in range(1, settings.steps + 1):
         if not order:
             order = list(rng.permutation(len(learners)))
@@ -125,12 +127,6 @@ def refine_gaussians(
     return Refinement(kept, kept_step, before, best, min(1.0, before / max(best, 1e-9) - 1), reason)
 
 
-def _counting(observation: Observation, margin: int) -> np.ndarray:
-    """[H, W] float32, how far pixels count: the target as it is trusted; round it the photo itself counts fully."""
-    target = observation.target
-    return np.where(target, observation.weight, dilated(target, margin)).astype(np.float32)
-
-
 class _State:
     """The new Gaussians on their way: Adam (Kingma 2015)."""
 
@@ -140,9 +136,9 @@ class _State:
         colour[0] = COLOUR
         rates: dict[str, float | np.ndarray] = {**RATES, "means": RATES["means"] * size, "sh": colour}
         self.rates = {name: rate for name, rate in rates.items() if name in learned}
-        self.gaussians = replace(new, **{name: getattr(new, name).copy() for name in self.rates})
+        self.steps, self.gaussians = 0, new
+        self.gaussians = self.copied()
         self.moments = {name: np.zeros((2, *getattr(new, name).shape), np.float32) for name in self.rates}
-        self.steps = 0
 
     def step(self, slopes: Gradients) -> None:
         """Move along the gradients; one that is no number does not count."""
@@ -164,15 +160,12 @@ class _View:
     """A view's part of the loss: what does not change between steps is prepared once."""
 
     def __init__(self, frozen: Gaussians, observation: Observation, margin: int = MARGIN) -> None:
-        self.camera = observation.camera
-        counting = _counting(observation, margin)
-        counted = counting > 0
-        self.region: PixelRegion = pixel_region(frozen, self.camera, counted, passes=frozenset({"rgb", "alpha"}))
-        self.window = bounds(counted, WINDOW // 2)
-        weight = counting[self.window]
-        self.share = (weight / weight.sum()).astype(np.float32)  # of each pixel in the loss
+        weight = observation.counting(margin)
+        self.region = pixel_region(frozen, observation.camera, weight > 0, passes=frozenset({"rgb", "alpha"}))
+        self.window = bounds(weight > 0, WINDOW // 2)
+        weight = weight[self.window]
+        self.counted, self.share = weight > 0, weight / weight.sum()  # by how much each pixel counts in the loss
         self.image = observation.image[self.window].astype(np.float32) / 255
-        self.counted = counted[self.window]
         self.mean = _blurred(self.image)
         self.variance = _blurred(self.image**2) - self.mean**2
 
@@ -192,7 +185,7 @@ class _View:
         likeness, uphill = self._ssim(rgb, share)
         loss = (1 - SSIM) * float((np.abs(off) * share).sum()) + SSIM * float(((1 - likeness) * share).sum())
         slope = (1 - SSIM) * np.sign(off) * share - SSIM * uphill
-        picture = np.zeros((self.camera.height, self.camera.width, 3), np.float32)
+        picture = np.zeros(drawn.rgb.shape, np.float32)
         picture[self.window] = slope * (self.counted[..., None] & (part >= 0) & (part <= 1))
         return loss, PictureGradients(rgb=picture)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import cv2
@@ -80,29 +79,10 @@ def mirror_image(gaussians: Gaussians, plane: Plane, camera: Camera) -> tuple[np
     return np.ascontiguousarray(alpha), decoded(colour).astype(np.float32) * alpha[..., None]
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """What views show of texels, linear light; V views, T texels."""
-
-    seen: np.ndarray  # [V, T] bool
-    photo: np.ndarray  # [V, T, 3] float32
-    alpha: np.ndarray  # [V, T] of the mirror image …
-    light: np.ndarray  # [V, T, 3] … and its light, times alpha
-
-    @classmethod
-    def take(cls, points: np.ndarray, witnesses: Sequence[Witness], texel: float, image: partial) -> _Samples:
-        said = ask(witnesses, points, ROUGH)
-        parts = parallel_map(lambda w: _sampled(points, w, texel, image), witnesses)
-        photo, alpha, light = (np.array([p[k] for p in parts], np.float32) for k in range(3))
-        seen = said == Says.SEEN
-        several = seen.sum(0) >= SEVERAL
-        return cls(seen[:, several], photo[:, several], alpha[:, several], light[:, several])
-
-
 def _sampled(
-    points: np.ndarray, witness: Witness, texel: float, image: partial
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A photo, and the mirror image's alpha and light, at points; pictures are as fine as texels."""
+    points: np.ndarray, witness: Witness, texel: float, gaussians: Gaussians, plane: Plane
+) -> tuple[np.ndarray, ...]:
+    """A photo [T, 3], and the mirror image's alpha [T] and light [T, 3], at points; pictures are as fine as texels."""
     uv, z = witness.camera.project(points)
     away = float(np.median(z))
     pixels = texel * witness.camera.fx / away if away > 0 else 1.0
@@ -110,8 +90,7 @@ def _sampled(
     photo = cv2.resize(linear(witness.photo), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     size = camera.width / witness.camera.width, camera.height / witness.camera.height
     at = np.nan_to_num(uv, nan=-1e4) * size
-    found = [colours_at(p.astype(np.float32), at) for p in (photo, *image(camera))]
-    return found[0], found[1], found[2]
+    return tuple(colours_at(p.astype(np.float32), at) for p in (photo, *mirror_image(gaussians, plane, camera)))
 
 
 @dataclass(frozen=True)
@@ -124,44 +103,42 @@ class _Fit:
     share: float  # of what differs where it is that it explains, noise left out
 
     @classmethod
-    def of(cls, samples: _Samples) -> _Fit:
+    def of(cls, seen: np.ndarray, photo: np.ndarray, alpha: np.ndarray, light: np.ndarray) -> _Fit:
+        """Of V views of T texels: where they see them [V, T] bool, and linear light: photos [V, T, 3], the mirror
+        image's alpha [V, T] and its light times alpha [V, T, 3]."""
         found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
-        there = samples.seen & (samples.alpha > MIRRORED)
-        if not samples.seen.any():  # few views, or none of one place
+        there = seen & (alpha > MIRRORED)
+        if not seen.any():  # few views, or none of one place
             return cls(found[0], found[1], 0.0, 0.0)
         for channel in range(3):
-            weight = samples.seen.astype(np.float64)
+            weight = seen.astype(np.float64)
             for _ in range(ROUNDS):
-                photo, light, alpha = (
+                shown, bright, dark = (
                     v - (weight * v).sum(0) / np.maximum(weight.sum(0), 1e-9)
-                    for v in (samples.photo[..., channel], samples.light[..., channel], -samples.alpha)
+                    for v in (photo[..., channel], light[..., channel], -alpha)
                 )
-                bends = np.array([[(weight * a * b).sum() for b in (light, alpha)] for a in (light, alpha)])
-                slopes = np.array([(weight * a * photo).sum() for a in (light, alpha)])
+                bends = np.array([[(weight * a * b).sum() for b in (bright, dark)] for a in (bright, dark)])
+                slopes = np.array([(weight * a * shown).sum() for a in (bright, dark)])
                 # of a plain object both are alike: the smaller strengths, then
                 root = np.linalg.cholesky(bends + (1e-3 * np.trace(bends) + 1e-12) * np.eye(2))
                 strength = nnls(root.T, np.linalg.solve(root, slopes))[0]
-                left = photo - strength[0] * light - strength[1] * alpha
-                noise = max(1.4826 * float(np.median(np.abs(left[samples.seen]))), LEAST_NOISE)
-                weight = samples.seen / np.sqrt(1 + (left / noise) ** 2)
+                left = shown - strength[0] * bright - strength[1] * dark
+                noise = max(1.4826 * float(np.median(np.abs(left[seen]))), LEAST_NOISE)
+                weight = seen / np.sqrt(1 + (left / noise) ** 2)
             found[:, channel] = strength
-            squares = weight * np.stack([photo, left]) ** 2 / noise**2
+            squares = weight * np.stack([shown, left]) ** 2 / noise**2
             gain += float(squares[0].sum() - squares[1].sum())
             explained += float((squares[0] - squares[1])[there].sum())
             # where photos hardly differ there is nothing to explain
             uneven += max(float((squares[0] - weight)[there].sum()), float(weight[there].sum()))
-        share = float(np.clip(explained / uneven, 0, 1)) if uneven > 0 else 0.0
-        return cls(found[0], found[1], gain, share)
+        return cls(found[0], found[1], gain, float(np.clip(explained / uneven, 0, 1)) if uneven > 0 else 0.0)
 
 
 def find_reflection(
-    gone: Gaussians,  # the object
-    plane: Plane,  # that it stands on
-    grounds: Sequence[Ground],
-    witnesses: Sequence[Witness],
-    region: Region,
+    gone: Gaussians, plane: Plane, grounds: Sequence[Ground], witnesses: Sequence[Witness], region: Region
 ) -> Reflection | str:
-    """The reflection that explains how photos of the same places differ; or why there is none.
+    """The reflection of what is gone, in the plane that it stood on, that explains how photos of the same places
+    differ; or why there is none.
 
     Whatever does not change with the view – texture, shadow – drops out of differences between photos of a place. A
     reflection must explain most of them where the mirror image is, and clearly more than that of the object elsewhere.
@@ -171,15 +148,18 @@ def find_reflection(
     if not mine or not len(object_):
         return "no reflection found: photos do not show the surface that the object stands on"
     ground, others = mine[0], [g for g in grounds if g.plane is not plane]
-    used = [witnesses[k * len(witnesses) // MOST_VIEWS] for k in range(MOST_VIEWS)]
-    used = list(witnesses) if len(witnesses) <= MOST_VIEWS else used
+    count = min(MOST_VIEWS, len(witnesses))
+    used = [witnesses[k * len(witnesses) // count] for k in range(count)]
     known = np.zeros_like(ground.known)
     known[::2, ::2] = ground.known[::2, ::2]
     points = ground.points()[known]
     texel = 2 * float(np.median(ground.depth)) / ground.camera.fx
+    seen = ask(used, points, ROUGH) == Says.SEEN
+    several = seen.sum(0) >= SEVERAL
 
     def fit(gaussians: Gaussians) -> _Fit:
-        return _Fit.of(_Samples.take(points, used, texel, partial(mirror_image, gaussians, plane)))
+        parts = parallel_map(lambda w: _sampled(points, w, texel, gaussians, plane), used)
+        return _Fit.of(seen[:, several], *(np.array([p[k] for p in parts])[:, several] for k in range(3)))
 
     own = fit(object_)
     words = f"the mirror image explains {own.share:.0%} of how photos differ where it is"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,7 @@ from ..geometry import SAME_DEPTH, bounds, cropped, directions, sees, surface_no
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
 from ..sh import sh_basis
-from ..solvers.harmonics import HarmonicsSettings, fit_harmonics
+from ..solvers.harmonics import HarmonicsSettings, Seen, fit_harmonics
 from .propagate import PaintedView, Rule
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of
@@ -31,6 +30,8 @@ THICKNESS = 0.1  # standard deviation along the normal, as a share of the smalle
 NEEDED = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is left out: 2 to 8 % of them
 HOLD = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
 LOOKS = 12  # painted views that colours are corrected by; more gain nothing that is measured
+
+Look = tuple[Camera, PaintedView]
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,14 @@ def seed_gaussians(
     BadInput
         If `settings.largest` is no power of two.
     """
-    if settings.largest < 1 or settings.largest & (settings.largest - 1):
-        raise BadInput(f"seed.largest: expected a power of two, got {settings.largest}")
-    part = _grid_round(target, settings.largest)
-    camera, image, depth, target = cropped(camera, part), image[part], depth[part], target[part]
+    size = settings.largest
+    if size < 1 or size & (size - 1):
+        raise BadInput(f"seed.largest: expected a power of two, got {size}")
+    rows, cols = (  # squares of the picture's grid that hold the target, and one more all round
+        slice(max(0, s.start // size - 1) * size, min(side, ((s.stop - 1) // size + 2) * size))
+        for s, side in zip(bounds(target), target.shape)
+    )
+    camera, image, depth, target = cropped(camera, (rows, cols)), *(a[rows, cols] for a in (image, depth, target))
     normals = surface_normals(camera, depth)
     there = target & (depth > 0) & (np.abs(normals).sum(-1) > 0)
     z = np.where(there, depth, 1.0).astype(np.float64)
@@ -103,20 +108,11 @@ def seed_gaussians(
     )
 
 
-def _grid_round(target: np.ndarray, size: int) -> tuple[slice, slice]:
-    """Rows and columns of the squares of a grid that hold the target [H, W] bool, and of one more all round."""
-    rows, cols = (
-        slice(max(0, s.start // size - 1) * size, min(side, ((s.stop - 1) // size + 2) * size))
-        for s, side in zip(bounds(target), target.shape)
-    )
-    return rows, cols
-
-
 def _patches(
     image: np.ndarray, disparity: np.ndarray, target: np.ndarray, normals: np.ndarray, settings: SeedSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rectangles (top, left, height, width) [N, 4] that tile the target [H, W] bool; sums [N, 7] of their colours
-    `image` [H, W, 3] uint8, disparities [H, W] and normals [H, W, 3].
+    (`image`, uint8), disparities and normals.
 
     From squares of a grid, every rectangle is halved, across the side where that saves more, until its colours are one
     and its surface is plane, nearly. Colours that change evenly would be blended well by few large splats, too, but
@@ -126,21 +122,20 @@ def _patches(
     """
     size = settings.largest
     tables = _SumTables(np.concatenate([image, disparity[..., None], normals], -1), target, size)
-    h, w = target.shape
-    corners = np.stack(np.meshgrid(np.arange(0, h, size), np.arange(0, w, size), indexing="ij"), -1).reshape(-1, 2)
+    corners = np.moveaxis(np.mgrid[: target.shape[0] : size, : target.shape[1] : size], 0, -1).reshape(-1, 2)
     pending = np.concatenate([corners, np.full_like(corners, size)], -1)
     done = []
     while len(pending):
-        pending = pending[tables.covered(pending) > 0]
-        misfit = tables.misfit(pending)
-        bend = np.sqrt(misfit[:, 3] / pending[:, 2:].prod(1)) * pending[:, 2:].prod(1) / tables.sums(pending)[:, 3]
+        pending = pending[_sum(tables.target, pending) > 0]
+        misfit, area = tables.misfit(pending), pending[:, 2:].prod(1)
+        bend = np.sqrt(misfit[:, 3] / area) * area / _sum(tables.values, pending)[:, 3]
         fine = (misfit[:, :3].sum(1) <= settings.detail) & (bend <= BEND) & tables.inside(pending)
-        fine |= pending[:, 2:].prod(1) == 1
+        fine |= area == 1
         done.append(pending[fine])
         pending = _halved(pending[~fine], tables)
     found = np.concatenate(done)
     found = found[np.lexsort((found[:, 1], found[:, 0]))]
-    return found, tables.sums(found)
+    return found, _sum(tables.values, found)
 
 
 def _halved(rectangles: np.ndarray, tables: _SumTables) -> np.ndarray:
@@ -164,52 +159,35 @@ class _SumTables:
     """Sums over rectangles (top, left, height, width) [N, 4] of a picture, each in constant time (Crow 1984)."""
 
     def __init__(self, values: np.ndarray, target: np.ndarray, size: int) -> None:
-        h, w = target.shape
-        beyond = ((0, -h % size), (0, -w % size))  # the grid's last squares
-        padded = np.pad(values.astype(np.float64), (*beyond, (0, 0)))
+        self.shape, beyond = target.shape, [(0, -side % size) for side in target.shape]  # the grid's last squares
+        padded = np.pad(values, (*beyond, (0, 0)))
         rows, cols = (i[..., None] + 0.5 for i in np.indices(padded.shape[:2]))
         fitted, disparity = padded[..., :4], padded[..., 3:4]
-        self.first = _table(padded)
-        self.moments = [_table(m) for m in (fitted**2, rows * disparity, cols * disparity)]
-        self.target = _table(np.pad(target, beyond)[..., None])
-        # what lies outside of the picture is no edge
-        self.margin = size // 2
-        free = np.ones((h + 2 * size, w + 2 * size), bool)
-        free[self.margin : self.margin + h, self.margin : self.margin + w] = target
-        self.free = _table(free[..., None])
-
-    def sums(self, rectangles: np.ndarray) -> np.ndarray:
-        """[N, 7]."""
-        return _sum(self.first, rectangles)
-
-    def covered(self, rectangles: np.ndarray) -> np.ndarray:
-        """Target pixels, [N]."""
-        return _sum(self.target, rectangles)[:, 0]
+        self.values, self.target = _table(padded), _table(np.pad(target, beyond))
+        self.moments = _table(np.concatenate([fitted**2, rows * disparity, cols * disparity], -1))
 
     def inside(self, rectangles: np.ndarray) -> np.ndarray:
-        """[N] bool: of target alone, and so is half a side all round."""
-        top, left, h, w = rectangles.T
-        around = np.stack([top + self.margin - h // 2, left + self.margin - w // 2, h + h // 2 * 2, w + w // 2 * 2], -1)
-        whole = self.covered(rectangles) == h * w
-        return whole & (_sum(self.free, around)[:, 0] == around[:, 2:].prod(1))
+        """[N] bool: of target alone, and so is half a side all round; what lies outside of the picture is no edge."""
+        corner, sides = rectangles[:, :2], rectangles[:, 2:]
+        low, high = np.maximum(corner - sides // 2, 0), np.minimum(corner + sides + sides // 2, self.shape)
+        around = np.concatenate([low, high - low], -1)
+        return np.all([_sum(self.target, r) == r[:, 2:].prod(1) for r in (rectangles, around)], axis=0)
 
     def misfit(self, rectangles: np.ndarray) -> np.ndarray:
         """Squared residuals, summed, [N, 4]: of colours from their mean, of disparity from its best plane."""
-        top, left, h, w = (r[:, None] for r in rectangles.T)
-        pixels = np.maximum(h * w, 1)
-        total = self.sums(rectangles)[:, :4]
-        squares, by_row, by_col = (_sum(m, rectangles) for m in self.moments)
-        rest = squares - total**2 / pixels
-        for moment, start, side in ((by_row, top, h), (by_col, left, w)):
-            lever = (pixels * (side**2 - 1) / 12)[:, 0]
-            slope = moment[:, 0] - (start + side / 2)[:, 0] * total[:, 3]
+        total, moments = _sum(self.values, rectangles)[:, :4], _sum(self.moments, rectangles)
+        pixels = np.maximum(rectangles[:, 2:].prod(1), 1)
+        rest = moments[:, :4] - total**2 / pixels[:, None]
+        for moment, start, side in zip(moments[:, 4:].T, rectangles[:, :2].T, rectangles[:, 2:].T):
+            lever = pixels * (side**2 - 1) / 12
+            slope = moment - (start + side / 2) * total[:, 3]
             rest[:, 3] -= slope**2 / np.where(lever > 0, lever, np.inf)
         return np.maximum(rest, 0.0)
 
 
 def _table(values: np.ndarray) -> np.ndarray:
-    """[H+1, W+1, C] sums of all above and to the left."""
-    return np.pad(values, ((1, 0), (1, 0), (0, 0))).astype(np.float64).cumsum(0).cumsum(1)
+    """[H+1, W+1, …] sums of all above and to the left."""
+    return np.pad(values.cumsum(0).cumsum(1), [(1, 0), (1, 0)] + [(0, 0)] * (values.ndim - 2))
 
 
 def _sum(table: np.ndarray, rectangles: np.ndarray) -> np.ndarray:
@@ -217,66 +195,77 @@ def _sum(table: np.ndarray, rectangles: np.ndarray) -> np.ndarray:
     return table[top + h, left + w] - table[top, left + w] - table[top + h, left] + table[top, left]
 
 
-def colour_gaussians(
+def settle_gaussians(
+    scene: Gaussians,  # without the new ones
     seeds: Gaussians,
     reference: Camera,
     views: Sequence[Camera],
     painted: Sequence[PaintedView],
-    scene_degree: int,
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
-    """The seeds with as many coefficients as the scene's Gaussians have.
-
-    The paper fits them here, to the painted views at the seeds' centres; else they are 0 until `settle_gaussians`.
-    """
-    degree, bands = min(settings.sh_degree, scene_degree), (scene_degree + 1) ** 2
-    sh = seeds.sh
-    if degree > 0 and not settings.corrections:
-        means = seeds.means.astype(np.float64)
-        seen = parallel_map(lambda pair: _seen_in(means, *pair), zip(views, painted))
-        colours = 0.5 + SH_C0 * sh[:, 0].astype(np.float64)
-        sh = fit_harmonics(colours, directions(means, reference), seen, degree, settings.harmonics)
-    sh = pad_sh(sh, bands).copy()
-    sh[:, 0] += (0.5 - settings.grey) / SH_C0
-    return replace(seeds, sh=sh)
-
-
-def settle_gaussians(
-    scene: Gaussians,  # without the new ones
-    new: Gaussians,
-    reference: Camera,
-    views: Sequence[Camera],
-    painted: Sequence[PaintedView],
-    settings: SeedSettings = SeedSettings(),
-) -> Gaussians:
-    """The new Gaussians that show somewhere, with colours such that the scene, drawn, shows the painted views.
+    """The seeds that show somewhere, of the scene's SH degree, in colours by which it, drawn, shows the painted views.
 
     Splats overlap one another and the rim, so a splat in its pixel's colour does not draw that pixel. A picture is
     linear in the colours c, pixels = W c + known; one gradient step of least squares, scaled by W's column sums
     (SIRT), takes most of what is missing. It is taken over views all round, and fits each Gaussian's coefficients to
     what each view misses: a step for the reference alone would undo, there, how near splats cover far ones, and double
-    that on the other side.
+    that on the other side. Without corrections, as in the paper, all seeds stay, and their colours are fitted to the
+    painted views at their centres.
     """
-    others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
-    looks = others[:: max(1, math.ceil(len(others) / LOOKS))]
+    degree, sh = min(settings.sh_degree, scene.sh_degree), seeds.sh
+    if degree > 0 and not settings.corrections:
+        sh = _fitted_at_centres(seeds, reference, list(zip(views, painted)), degree, settings.harmonics)
+    sh = pad_sh(sh, (scene.sh_degree + 1) ** 2).copy()
+    sh[:, 0] += (0.5 - settings.grey) / SH_C0
+    new = replace(seeds, sh=sh)
     if not settings.corrections:
         return new
+    others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
+    looks = others[:: math.ceil(len(others) / LOOKS) or 1]
     joined = scene.extended(new)
 
     def peak(camera: Camera) -> np.ndarray:
         there = window_mask(touched_window(new, camera), camera)
         return contributions(joined, camera, pixels=there).peak[len(scene) :]
 
+    def step(look: Look) -> tuple[np.ndarray, np.ndarray]:
+        """See missing_colours: of what the view's own pixels painted."""
+        camera, paint = look
+        wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
+        region = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"}))
+        return missing_colours(region, new, wanted, paint.pasted(np.zeros((*wanted.shape, 3), np.uint8)))
+
     peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
     new = new.take(np.max(peaks, axis=0) >= NEEDED)
     for _ in range(settings.corrections if looks else 0):
-        steps = parallel_map(partial(_colour_step, scene, new), looks)
+        steps = parallel_map(step, looks)
         towards = [directions(new.means.astype(np.float64), view) for view, _ in looks]
-        change = _colour_change(steps, towards, min(settings.sh_degree, new.sh_degree), HOLD)
+        change = _colour_change(steps, towards, degree, HOLD)
         sh = new.sh.copy()
         sh[:, : change.shape[1]] += change
         new = replace(new, sh=sh)
     return new
+
+
+def _fitted_at_centres(
+    seeds: Gaussians, reference: Camera, looks: Sequence[Look], degree: int, settings: HarmonicsSettings
+) -> np.ndarray:
+    """The paper's SH [N, K, 3] of the seeds."""
+    means = seeds.means.astype(np.float64)
+
+    def seen_in(look: Look) -> Seen:
+        """By pixels of the view's own."""
+        view, paint = look
+        height, width = paint.rules.shape
+        part = cropped(view, (slice(paint.top, paint.top + height), slice(paint.left, paint.left + width)))
+        visible = np.flatnonzero(sees(part, paint.depth, means, SAME_DEPTH))
+        cols, rows = part.project(means[visible])[0].astype(int).T
+        own = np.isin(paint.rules[rows, cols], OWN_RULES)
+        index = visible[own]
+        return index, directions(means[index], view), paint.image[rows[own], cols[own]] / 255.0
+
+    colours = 0.5 + SH_C0 * seeds.sh[:, 0].astype(np.float64)
+    return fit_harmonics(colours, directions(means, reference), parallel_map(seen_in, looks), degree, settings)
 
 
 def _colour_change(
@@ -308,14 +297,6 @@ def _colour_change(
     return change
 
 
-def _colour_step(scene: Gaussians, new: Gaussians, look: tuple[Camera, PaintedView]) -> tuple[np.ndarray, np.ndarray]:
-    """See missing_colours: of what the view's own pixels painted."""
-    camera, paint = look
-    wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
-    region = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"}))
-    return missing_colours(region, new, wanted, paint.pasted(np.zeros((*wanted.shape, 3), np.uint8)))
-
-
 def missing_colours(
     region: PixelRegion,  # of the rest of the scene
     new: Gaussians,
@@ -328,15 +309,3 @@ def missing_colours(
     one = np.broadcast_to(wanted[..., None], missing.shape)
     weights, error = (way_back.backward(PictureGradients(rgb=g.astype(np.float32))).sh[:, 0] for g in (one, missing))
     return weights / SH_C0, error / SH_C0**2
-
-
-def _seen_in(means: np.ndarray, view: Camera, paint: PaintedView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the seeds that a painted view shows by pixels of its own, the directions to them, and their colours."""
-    height, width = paint.rules.shape
-    part = cropped(view, (slice(paint.top, paint.top + height), slice(paint.left, paint.left + width)))
-    visible = np.flatnonzero(sees(part, paint.depth, means, SAME_DEPTH))
-    uv, _ = part.project(means[visible])
-    cols, rows = uv.astype(int).T
-    own = np.isin(paint.rules[rows, cols], OWN_RULES)
-    index = visible[own]
-    return index, directions(means[index], view), paint.image[rows[own], cols[own]] / 255.0

@@ -1,4 +1,9 @@
-"""The object's shadow: the light that it keeps from surfaces, found by casting its own Gaussians from all sides."""
+"""The object's shadow: the light that it keeps from surfaces, found by casting its own Gaussians from all sides.
+
+Lamps cast shadows that have a shape; what the object keeps from its nearest surroundings of the light of a whole room
+has none but that of its own foot: a dark rim round what it hides. That is narrow, so it is looked for on charts, and
+only beside the hole.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +16,14 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy.ndimage
+from scipy.spatial import cKDTree
 
 from ..box import Region
 from ..gaussians import Gaussians
 from ..geometry import colours_at, dilated
 from ..solvers.lights import Shading
+from ..srgb import linear
+from .charts import Chart
 from .charts.plane import Plane, extent
 from .ground import FEWEST, ROUGH, Ground
 from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
@@ -26,6 +34,17 @@ DULL = 0.5  # share of the light that the object takes from a surface and does n
 UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
 FINER = 2  # times as many along a side, in which it is stored
 EDGES = (0.7, 1.5, 3.0, 6.0)  # texels, σ of the edges that a marked shadow may have
+MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
+# Of the rim:
+WIDTH = 0.1  # of the hole's size: as far as such a shadow is sought; as far again lies what it is compared with
+LEAST_WIDTH = 3.0  # texels of that
+STRIPS = 4  # of equal distance from the hole, each of which may be dark
+LIKE = 0.3  # log of a ratio of channels by which a surface's colours differ as much as one width away
+COMPARED = 15  # texels of like colour with which one is compared
+VISIBLE = 0.1  # of log luminance, below which nobody sees a rim
+CHANCE = 3.0  # times as much of the outline must be dark as farther out, where nothing touches anything
+TOO_DARK = 1.01 - MIXED  # share of light; what only pixels show that may be the object's, in its shadow, is filled
+SOME = 0.05  # share of the outline that chance makes dark at least
 
 
 @dataclass(frozen=True)
@@ -35,19 +54,14 @@ class Shadow:
     grounds: tuple[Ground, ...]  # what it may fall on
     occluder: Occluder | None  # None: masks tell
     lights: tuple[Light, ...]
-    taken: tuple[
-        np.ndarray, ...
-    ]  # [h, w, 3] float32 each: the share of light taken from a ground, all over its picture
+    taken: tuple[np.ndarray, ...]  # [h, w, 3] float32 each: the share of light taken from a ground, in all its picture
     explained: float  # share of the unevenness of light, where it falls, that it explains
     confidence: float  # 1 less what chance explains over what the lights do
     reason: str
 
-    def arriving(
-        self,
-        points: np.ndarray,  # [N, 3] scene coordinates
-        ground: int = -1,  # that they are on: its index; −1: none
-    ) -> np.ndarray:
-        """[N, 3] the share of light, per channel, that the object lets through; 1 far from it."""
+    def arriving(self, points: np.ndarray, ground: int) -> np.ndarray:
+        """[N, 3] the share of light, per channel, that the object lets through; 1 far from it. The points [N, 3], scene
+        coordinates, are on the ground of an index; −1: on none."""
         if ground >= 0:
             taken, (h, w) = self.taken[ground], self.grounds[ground].known.shape
             uv, _ = self.grounds[ground].camera.project(points)
@@ -73,49 +87,33 @@ class Shadow:
 
     def facts(self) -> dict[str, Any]:
         """For the summary: lights by degrees, strengths in shares of light."""
-        lights = [
-            {
-                "elevation": round(light.elevation, 2),
-                "azimuth": round(light.azimuth(self.occluder.plane), 2),
-                "softness": round(light.softness, 2),
-                "direction": [round(float(x), 4) for x in light.direction(self.occluder.plane)],
-                "strength": [round(float(x), 3) for x in light.strength],
-            }
-            for light in self.lights
-            if self.occluder is not None and math.isfinite(light.softness)
-        ]
+        suns = [light for light in self.lights if math.isfinite(light.softness)]
         sky = [light.strength for light in self.lights if not math.isfinite(light.softness)]
         return {
             "found": True,
-            "lights": lights,
+            "lights": [light.facts(self.occluder.plane) for light in suns] if self.occluder is not None else [],
             "sky": [round(float(x), 3) for x in sky[0]] if sky else None,
             "explained": round(self.explained, 3),
             "confidence": round(self.confidence, 3),
         }
 
 
-def find_shadow(
-    gone: Gaussians,  # the object
-    planes: Sequence[Plane],  # of the surfaces round it, the support first
-    grounds: Sequence[Ground],  # of those planes, as far as photos show them
-    region: Region,
-) -> Shadow | str:
-    """The lights whose shadows of the object explain what is dark round it; or why there is none.
+def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], region: Region) -> Shadow | str:
+    """The lights whose shadows of the object, `gone`, explain what is dark round it; or why there is none.
 
     Candidates are lobes of light all over the sky. The one that explains most of the differences of luminance round
     the object is taken, then the next. Texture is explained a little by any shape: a light must explain clearly more
     than brightness of any such shape does, here or where the object might as well stand. And a stain is dark, too: a
     light must explain most of what is uneven where its shadow falls.
     """
-    if not planes:
-        return "no shadow found: no surface is known that it could fall on"
-    occluder = Occluder.make(gone, planes[0], extent(region), [g.plane for g in grounds])
+    occluder = Occluder.make(gone, support, extent(region), [g.plane for g in grounds])
     if occluder is None:
         return "no shadow found: nothing stands on the surface"
-    receivers = [half for half in (Receiver.make(g).halved() for g in grounds) if half.surface.shown.sum() >= FEWEST]
+    fine = [Receiver.make(g) for g in grounds]
+    receivers = [half for half in (r.halved() for r in fine) if half.shown.sum() >= FEWEST]
     if not receivers:
         return "no shadow found: photos do not show the surface round the object"
-    scenery = Scenery.make(occluder, receivers)
+    scenery = Scenery(occluder, receivers)
     lights, told = search(scenery)
     if not lights:
         return (
@@ -124,12 +122,10 @@ def find_shadow(
         )
     sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
     lights = [*scenery.settled(lights, [sky], FINEST), sky]
-    fine = [Receiver.make(g) for g in grounds]
-    casts = replace(scenery, receivers=fine).casts(lights)
-    broad = Shading.make([r.surface for r in fine], BROAD, bent=False)
+    casts, broad = Scenery(occluder, fine).casts(lights), Shading.make(fine, BROAD, bent=False)
     # what comes from no light comes from the sky: wide shadows of that are hardly told from paint
     suns, skies = casts[:, :-1] - DULL * casts[:, -1:], casts[:, -1:]
-    strength, _, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
+    strength, _ = broad.fit(np.concatenate([suns, skies], 1), np.array([*[0.0] * suns.shape[1], DULL]))
     strength[-1] -= DULL * strength[:-1].sum()
     tints = broad.tints(casts, strength)
     coarse = scenery.casts(lights)
@@ -143,31 +139,30 @@ def find_shadow(
         for light in lights[:-1]
     )
     words += f", {lights[-1].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
-    maps = [g.points(FINER) for g in grounds]
-    taken = tuple(
-        taken_from(occluder, lights, p.reshape(-1, 3), g.plane.normal).reshape(p.shape).astype(np.float32)
-        for g, p in zip(grounds, maps)
-    )
+
+    def taken(ground: Ground) -> np.ndarray:
+        points = ground.points(FINER)
+        share = taken_from(occluder, lights, points.reshape(-1, 3), ground.plane.normal)
+        return share.reshape(points.shape).astype(np.float32)
+
     confidence = told.share * (1 - 1 / told.over_chance)
-    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, confidence, words)
+    return Shadow(tuple(grounds), occluder, tuple(lights), tuple(map(taken, grounds)), explained, confidence, words)
 
 
 def marked_shadow(
-    masks: Sequence[np.ndarray | None],  # [H, W] bool of the witnesses' views; None where the user marked none
-    grounds: Sequence[Ground],
-    witnesses: Sequence[Witness],
+    masks: Sequence[np.ndarray | None], grounds: Sequence[Ground], witnesses: Sequence[Witness]
 ) -> Shadow | str:
-    """The shadow that a user marked: where most of the masks see it on a ground, as dark as photos show it there.
+    """The shadow that a user marked, in masks [H, W] bool of the witnesses' views, None where there is none: where most
+    of them see it on a ground, as dark as photos show it there.
 
     Its edge is as soft as photos show it: shapes of several softnesses share the strength.
     """
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
-    receivers = [Receiver.make(g) for g in grounds]
     shapes = [_marked_on(ground, masks, witnesses) for ground in grounds]
     shadows = np.concatenate([s[g.known] for s, g in zip(shapes, grounds)])
-    lit = Shading.make([r.surface for r in receivers], LEVELS)
-    strength, besides, _ = lit.fit(shadows)
+    lit = Shading.make([Receiver.make(g) for g in grounds], LEVELS)
+    strength, besides = lit.fit(shadows)
     if strength.sum() < FAINT:
         return "what is marked as shadow is not darker than what is round it: nothing is lifted"
     explained = lit.explained(shadows @ strength, besides)
@@ -192,6 +187,82 @@ def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Se
     marked = ((2 * votes > voters) & (voters > 0)).reshape(ground.known.shape).astype(np.float32)
     # what the object hides lies in its shadow, or the edge of the mask beside it would be one of light
     hole = ((said == Says.HIDDEN).any(0) & (voters == 0)).reshape(ground.known.shape)
-    labels, _ = scipy.ndimage.label(hole)
-    marked[np.isin(labels, np.unique(labels[hole & dilated(marked > 0, 2)]))] = 1.0
+    marked[scipy.ndimage.binary_propagation(hole & dilated(marked > 0, 2), mask=hole)] = 1.0
     return np.stack([cv2.GaussianBlur(marked, (0, 0), sigma) for sigma in EDGES], -1)
+
+
+def find_contact(charts: Sequence[Chart]) -> Shadow | str:
+    """The dark rims round the charts' holes; or why they count for none.
+
+    A texel beside the hole is compared with the nearest ones of its colour a little farther out. It is in the shadow
+    if most of what lies as near to the hole as it does, and not far from it, is darker than there. Textures are dark by
+    chance as well: as often where nothing stands, one width away.
+    """
+    found = [(c, *_rim(c)) for c in charts]
+    rims = [(chart, taken, share) for chart, taken, share, by_chance in found if share > CHANCE * max(by_chance, SOME)]
+    if not rims:
+        return "no dark rim found where it touches a surface"
+    share = max(share for _, _, share in rims)
+    most = max(float(np.percentile(taken[taken > 0], 90)) for _, taken, _ in rims)
+    words = f"a dark rim round {share:.0%} of its outline, where up to {most:.0%} of the light is missing"
+    grounds = tuple(Ground(c.plane, c.camera, c.depth, c.there, c.image, c.known, c.hole) for c, _, _ in rims)
+    taken = tuple(np.repeat(t[..., None], 3, axis=-1).astype(np.float32) for _, t, _ in rims)
+    return Shadow(grounds, None, (), taken, share, 1 - 1 / CHANCE, words)
+
+
+def _rim(chart: Chart) -> tuple[np.ndarray, float, float]:
+    """[H, W] the share of light that is taken, and of what share of the outline; and what chance makes of that."""
+    width = max(LEAST_WIDTH, WIDTH * float(np.sqrt(chart.hole.sum())))
+    # what photos show beside the hole only where they may show the object as well counts as hole
+    unseen = chart.hole | (chart.there & (chart.photos == 0))
+    near = cv2.distanceTransform((~chart.hole).astype(np.uint8), cv2.DIST_L2, 5) <= width
+    hole = chart.hole | (near & scipy.ndimage.binary_propagation(chart.hole, mask=unseen))
+    far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+    logs = np.log(linear(chart.image) + DARK)
+    luminance, hue = np.log(np.exp(logs).mean(-1)), logs[..., [0, 2]] - logs[..., 1:2]
+    shown = chart.there & (chart.photos > 0) & ~hole
+
+    def darker(start: float) -> tuple[np.ndarray, np.ndarray]:
+        """Texels within a width of a distance, and by how much they are brighter than those beyond."""
+        here = shown & (far > start) & (far <= start + width)
+        beyond = shown & (far > start + width) & (far <= start + 2.5 * width)
+        change = np.zeros(far.shape, np.float32)
+        if here.any() and beyond.sum() >= COMPARED:
+            places = [np.column_stack([np.argwhere(on) / width, hue[on] / LIKE]) for on in (beyond, here)]
+            nearest = cKDTree(places[0]).query(places[1], k=COMPARED)[1]
+            change[here] = luminance[here] - np.median(luminance[beyond][nearest], axis=1)
+        return here, change
+
+    elsewhere, by_chance = darker(width)
+    if not elsewhere.any():
+        return np.zeros(far.shape), 0.0, 1.0
+    limit = max(VISIBLE, 1.4826 * float(np.median(np.abs(by_chance[elsewhere]))))
+    here, change = darker(0.0)
+    outside = elsewhere & (far <= width + width / STRIPS)
+    level, inside = np.zeros(far.shape, np.float32), hole
+    for k in range(STRIPS):
+        strip = here & (far > k * width / STRIPS) & (far <= (k + 1) * width / STRIPS)
+        dark, mean = _mostly_dark(strip, change, limit, width)
+        inside = dark & dilated(inside, max(1, round(width / STRIPS)))
+        level[inside] = mean[inside]
+        if k == 0:
+            share = float(inside.sum() / max(1, strip.sum()))
+    chance = float(_mostly_dark(outside, by_chance, limit, width)[0].sum() / max(1, outside.sum()))
+    # without steps, and beside the object so much that it is filled
+    taken = 1 - np.exp(cv2.GaussianBlur(level, (0, 0), width / (2 * STRIPS)))
+    filled = hole & dilated(level < 0, round(width))
+    taken[filled] = np.maximum(taken[filled], TOO_DARK)
+    return taken, share, chance
+
+
+def _mostly_dark(strip: np.ndarray, change: np.ndarray, limit: float, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool: parts of a strip, bool, most of whose surroundings along it are darker, by the change of their log
+    luminance; and by how much."""
+    side = (2 * round(width) + 1,) * 2
+
+    def along(values: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(values.astype(np.float32), -1, side, normalize=False, borderType=cv2.BORDER_CONSTANT)
+
+    shaded = strip & (change < -limit)
+    count = along(shaded)
+    return strip & (count > 0.5 * along(strip)), along(np.where(shaded, change, 0)) / np.maximum(count, 1)

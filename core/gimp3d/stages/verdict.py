@@ -9,8 +9,8 @@ the object, an open hole. The score compares it with the error of the surroundin
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -37,6 +37,20 @@ LEAST_ERROR = 1.0  # of 8-bit pictures
 HALF = 9.0  # times the error of the surroundings that scores ½ when it is added: 10 dB worse
 GOOD, FAIR = 0.75, 0.5  # scores
 FINE = 2.0  # px, σ of the blur that leaves no detail
+SOUND = (  # figures of the verdict, between which values nothing is amiss, and words for what is
+    ("open_share", 0, 0.02, "{:.0%} of the hole is open: add views from other sides, or take the preset best"),
+    ("remains", 0, 0.05, "{:.0%} of the object's place still looks like it: enlarge the box until all of it is inside"),
+    ("haze", 0, 0.05, "haze covers {:.0%} of what was behind the object: enlarge the box, or add one round the haze"),
+    ("ring_fidelity", -0.5, math.inf, "the surroundings lost {:.1f} dB against the photos: make the box tighter"),
+    (
+        "sharpness",
+        0.5,
+        2,
+        "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed",
+    ),
+    ("agreement", 0.7, 1, "only {:.0%} of the object's place looks as photos show it: mark shadows and reflections"),
+    ("invented", 0, 0.3, "no photo shows {:.0%} of the object's place: paint one view if the fill does not convince"),
+)
 
 
 @dataclass(frozen=True)
@@ -73,18 +87,18 @@ class _Look:
 
 @dataclass(frozen=True)
 class _Sample:
-    """Every n-th row and column of a look; [h, w] or [h, w, 3]."""
+    """Pixels of looks' every n-th row and column, [N]: the object's, and beside it those whose colours are told."""
 
-    object: np.ndarray  # bool
-    ring: np.ndarray  # bool, where something tells its colours
-    photo: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    expected: np.ndarray  # colours without the object
-    variance: np.ndarray  # of the true ones about them
+    object: np.ndarray  # bool, of the object; the others lie beside it
     told: np.ndarray  # bool, by photos
     given: np.ndarray  # bool, by the given picture
-    points: np.ndarray
+    remains: np.ndarray  # bool, of the object, and drawn like it
+    usual: np.ndarray  # squared error before the removal
+    missed: np.ndarray  # squared error of what is drawn
+    variance: np.ndarray  # of true colours about those that are expected
+    points: np.ndarray  # [N, 3]
+    drawn: np.ndarray  # [N, 3] float32, grey levels
+    look: np.ndarray  # whose pixel it is
 
     @property
     def unseen(self) -> np.ndarray:
@@ -116,7 +130,8 @@ def judge(
         photo = photos[view.camera.id].astype(np.float32)
         away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
         near, around = away <= RING, away > EDGE
-        beside = around & (away <= _reach(away[around], int(view.silhouette.sum())))
+        # as many pixels as the object has
+        beside = around & (away <= np.sort(away[around])[: view.silhouette.sum()].max(initial=0))
         before = _drawn(scene, view.camera, (near & around) | beside)
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
         chart, off = np.zeros((2, *near.shape), np.float32)
@@ -136,83 +151,68 @@ def judge(
             chart,
             off,
             weights.footprint(floats),
-            _mean([_squared(before, photo)[beside]]),
+            _mean(_squared(before, photo)[beside]),
         )
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
     total = sum(int(look.view.silhouette.sum()) for look in looks)
     step = max(1, round(math.sqrt(total / POINTS)))
     tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
-    samples = parallel_map(lambda x: _sampled(x, step, witnesses, tolerance, given), looks)
-    return _summed(looks, samples, still_open, views, bool(photographed), bool(charts))
+    parts = parallel_map(lambda k: _sampled(looks, k, step, witnesses, tolerance, given), range(count))
+    sample = _Sample(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Sample)))
+    open_share = sum(int(m.sum()) for m in still_open) / max(1, sum(int(v.target.sum()) for v in views))
+    return _summed(looks, sample, open_share, bool(photographed), bool(charts))
 
 
 def _summed(
-    looks: Sequence[_Look],
-    samples: Sequence[_Sample],
-    still_open: Sequence[np.ndarray],
-    views: Sequence[ViewMasks],
-    with_photos: bool,
-    with_charts: bool,
+    looks: Sequence[_Look], sample: _Sample, open_share: float, with_photos: bool, with_charts: bool
 ) -> Verdict:
-    hole = sum(int(v.target.sum()) for v in views)
-    objects = _count(s.object for s in samples)
     error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
-    added = _added_error(samples)
-    before = _mean(_squared(look.before, look.photo)[look.ring] for look in looks)
-    after = _mean(_squared(look.after, look.photo)[look.ring] for look in looks)
-    alike = _alike(looks, samples)
+    before = _mean(*(_squared(look.before, look.photo)[look.ring] for look in looks))
+    after = _mean(*(_squared(look.after, look.photo)[look.ring] for look in looks))
+    added, alike = _added_error(sample), _alike(looks, sample)
     verdict = Verdict(
         score=1 / (1 + added / (HALF * error)),
-        open_share=_count(still_open) / max(1, hole),
-        remains=_count(map(_like_object, samples)) / objects,
-        haze=_mean(look.haze[look.view.silhouette] for look in looks) if with_charts else None,
+        open_share=open_share,
+        remains=int(sample.remains.sum()) / int(sample.object.sum()),
+        haze=_mean(*(look.haze[look.view.silhouette] for look in looks)) if with_charts else None,
         ring_fidelity=10 * math.log10(max(before, LEAST_ERROR) / max(after, LEAST_ERROR)) if with_photos else None,
         sharpness=_sharpness(looks),
         agreement=float(alike.mean()) if with_photos and len(alike) else None,
-        invented=_count(s.unseen for s in samples) / objects,
+        invented=int(sample.unseen.sum()) / int(sample.object.sum()),
         expected_error=10 * math.log10(1 + added / error),
         words=(),
     )
     return replace(verdict, words=_words(verdict))
 
 
-def _added_error(samples: Sequence[_Sample]) -> float:
+def _added_error(sample: _Sample) -> float:
     """The mean squared error to be expected of the object's pixels beyond that of the scene itself, grey levels²."""
-    photo, picture = [s.object & s.told for s in samples], [s.object & s.given for s in samples]
-    unseen = [s.unseen for s in samples]
-
-    def missed(where: Sequence[np.ndarray]) -> float:
-        return _mean(_squared(s.after, s.expected)[w] for s, w in zip(samples, where))
-
-    def unknown(where: Sequence[np.ndarray]) -> float:
-        return _mean(s.variance[w] for s, w in zip(samples, where))
-
-    usual = _mean(_squared(s.before, s.expected)[s.ring] for s in samples)
+    photo, picture, unseen = sample.object & sample.told, sample.object & sample.given, sample.unseen
+    missed, variance, usual = sample.missed, sample.variance, _mean(sample.usual[~sample.object])
     # What other views show differs from what this one sees: by as much as it does round the object, nothing is wrong.
     # Where nothing shows a place, the truth differs from what is expected as texture does, however little the fill.
     errors = (
-        max(0.0, missed(photo) - usual),
-        max(0.0, missed(picture) - usual) + unknown(picture),
-        max(missed(unseen), unknown(unseen)),
+        max(0.0, _mean(missed[photo]) - usual),
+        max(0.0, _mean(missed[picture]) - usual) + _mean(variance[picture]),
+        max(_mean(missed[unseen]), _mean(variance[unseen])),
     )
-    pixels = [_count(where) for where in (photo, picture, unseen)]
-    return float(np.average(errors, weights=pixels))
+    return float(np.average(errors, weights=[int(where.sum()) for where in (photo, picture, unseen)]))
 
 
-def _alike(looks: Sequence[_Look], samples: Sequence[_Sample]) -> np.ndarray:
+def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
     """[N] bool: pixels of the object that differ from photos, else from other views, as is usual round it."""
-    usual = np.concatenate([_squared(s.before, s.expected)[s.ring] for s in samples])
+    usual = sample.usual[~sample.object]
     limit = max(LEAST_ERROR, float(np.percentile(usual, 95)) if len(usual) else 0.0)
     drawn = [
         _witness(look.view.camera, np.rint(look.after).astype(np.uint8), np.zeros(look.depth.shape, bool), look.depth)
         for look in looks
     ]
-    found = []
-    for k, sample in enumerate(samples):
-        found.append(_squared(sample.after, sample.expected)[sample.object & sample.told] <= limit)
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[sample.unseen], SAME_DEPTH)
-        found.append((_squared(sample.after[sample.unseen], colours) <= limit)[seen])
+    found = [sample.missed[sample.object & sample.told] <= limit]
+    for k in range(len(looks)):
+        own = sample.unseen & (sample.look == k)
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[own])
+        found.append((_squared(sample.drawn[own], colours) <= limit)[seen])
     return np.concatenate(found)
 
 
@@ -220,32 +220,15 @@ def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.
     return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
 
 
-def _reach(away: np.ndarray, count: int) -> float:
-    """The distance within which so many of the pixels [N] lie."""
-    k = min(count, len(away)) - 1
-    return float(np.partition(away, k)[k]) if k >= 0 else 0.0
-
-
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """[h, w]: mean of the channels' squared differences."""
     return np.asarray(((a - b) ** 2).mean(-1))
 
 
-def _mean(parts: Iterable[np.ndarray]) -> float:
+def _mean(*parts: np.ndarray) -> float:
     """Of all numbers in the arrays; 0 of none."""
-    all_ = np.concatenate(list(parts))
+    all_ = np.concatenate(parts)
     return float(all_.mean(dtype=np.float64)) if len(all_) else 0.0
-
-
-def _count(masks: Iterable[np.ndarray]) -> int:
-    return sum(int(m.sum()) for m in masks)
-
-
-def _like_object(sample: _Sample) -> np.ndarray:
-    """[h, w] bool: drawn more like the photo with the object than like what is expected without it."""
-    change, made = sample.photo - sample.expected, sample.after - sample.expected
-    along = cv2.blur((made * change).sum(-1), (3, 3)) > 0.5 * cv2.blur((change**2).sum(-1), (3, 3))
-    return sample.object & along & (_squared(sample.photo, sample.expected) > UNLIKE**2)
 
 
 def _sharpness(looks: Sequence[_Look]) -> float | None:
@@ -264,27 +247,23 @@ def _sharpness(looks: Sequence[_Look]) -> float | None:
 
 
 def _sampled(
-    look: _Look, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
+    looks: Sequence[_Look], k: int, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
 ) -> _Sample:
-    camera = look.view.camera
-    thin = (slice(None, None, step), slice(None, None, step))
-    object_, ring, photo, depth, chart = (
-        a[thin] for a in (look.view.silhouette, look.ring, look.photo, look.depth, look.chart)
-    )
+    look, thin = looks[k], np.s_[::step, ::step]
+    camera, object_ = look.view.camera, look.view.silhouette[thin]
+    ring, photo, after, depth, chart = (a[thin] for a in (look.ring, look.photo, look.after, look.depth, look.chart))
     others = [w for w in witnesses if w.camera.id != camera.id]
     centres = camera.pixel_centres()[thin]
     # charts are what was behind the object, unless photos show what is drawn before them
     standing = object_ & (depth > 0) & (depth < (1 - tolerance) * chart)
-    standing[standing] = shown(
-        others, camera.unproject(centres[standing], depth[standing].astype(np.float64)), SAME_DEPTH
-    )[1]
+    standing[standing] = shown(others, camera.unproject(centres[standing], depth[standing].astype(np.float64)))[1]
     off_chart = (chart == 0) | standing | (ring & (np.abs(depth - chart) > tolerance * chart))
     surface = np.where(off_chart, depth, chart)
     points = camera.unproject(centres, surface.astype(np.float64))
     asked = (object_ | ring) & (surface > 0)
     told, by_picture = np.zeros((2, *asked.shape), bool)
     expected = photo.copy()
-    colours, told[asked] = shown(others, points[asked], SAME_DEPTH, tolerance)
+    colours, told[asked] = shown(others, points[asked], tolerance)
     expected[told] = colours[told[asked]]
     if given is not None:
         left = object_ & asked & ~told
@@ -295,36 +274,34 @@ def _sampled(
     unknown = object_ & ~told & ~by_picture
     expected[unknown] = foretold[unknown]
     if given is not None:
-        variance += by_picture * 2 * np.interp(_shift(look, thin, points, surface, given.camera) / step, *lags)
-    return _Sample(
-        object_, ring & told, photo, look.before[thin], look.after[thin], expected, variance, told, by_picture, points
-    )
+        here, there = points - camera.centre, points - given.camera.centre
+        lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
+        sine = np.linalg.norm(np.cross(here, there), axis=-1) / np.maximum(lengths, 1e-12)
+        # px by which this view may see the picture's pixels elsewhere, as the surface's height is not known
+        shift = camera.fx * look.unsure[thin] * sine / np.maximum(surface, 1e-9)
+        variance += by_picture * 2 * np.interp(shift / step, *lags)
+    change, made = photo - expected, after - expected
+    along = cv2.blur((made * change).sum(-1), (3, 3)) > 0.5 * cv2.blur((change**2).sum(-1), (3, 3))
+    remains = object_ & along & (_squared(photo, expected) > UNLIKE**2)
+    errors = (_squared(drawn, expected) for drawn in (look.before[thin], after))
+    kept = object_ | (ring & told)
+    maps = object_, told, by_picture, remains, *errors, variance, points, after, np.full(kept.shape, k)
+    return _Sample(*(m[kept] for m in maps))
 
 
 def shown(
     witnesses: Sequence[Witness],
     points: np.ndarray,  # [N, 3]
-    tolerance: float,  # relative z by which what a view shows may be nearer
-    farther: float | None = None,  # by which it may be farther; None: as much
+    farther: float = SAME_DEPTH,  # relative z by which what a view shows may lie behind; before, it is SAME_DEPTH
 ) -> tuple[np.ndarray, np.ndarray]:
     """The median colour of the views that show a point [N, 3] float32, 0 of none; and whether any does [N]."""
-    seen = ask(witnesses, points, farther or tolerance) == Says.SEEN
-    seen &= ask(witnesses, points, tolerance) != Says.BEHIND
+    seen = (ask(witnesses, points, farther) == Says.SEEN) & (ask(witnesses, points, SAME_DEPTH) != Says.BEHIND)
     colours = np.full((len(witnesses), len(points), 3), np.nan, np.float32)
     for k, witness in enumerate(witnesses):
         colours[k, seen[k]] = colours_at(witness.photo, witness.camera.project(points[seen[k]])[0])
     told, median = seen.any(0), np.zeros((len(points), 3), np.float32)
-    if told.any():
-        median[told] = np.nanmedian(colours[:, told], axis=0)
+    median[told] = np.nanmedian(colours[:, told], axis=0)
     return median, told
-
-
-def _shift(look: _Look, thin: tuple[slice, slice], points: np.ndarray, surface: np.ndarray, eye: Camera) -> np.ndarray:
-    """[h, w] px by which a view may see another one's pixels elsewhere, as the surface's height is not known."""
-    here, there = points - look.view.camera.centre, points - eye.centre
-    lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
-    sine = np.linalg.norm(np.cross(here, there), axis=-1) / np.maximum(lengths, 1e-12)
-    return look.view.camera.fx * look.unsure[thin] * sine / np.maximum(surface, 1e-9)
 
 
 def _height_doubt(chart: Chart) -> np.ndarray:
@@ -364,25 +341,6 @@ def _words(v: Verdict) -> tuple[str, ...]:
     """What it comes to; then, of each thing that is amiss, how much, and what to do."""
     level = "good" if v.score >= GOOD else "fair" if v.score >= FAIR else "poor"
     times = 10 ** (v.expected_error / 20)
-    words = [f"{level}: errors where the object was are probably {times:.1f} times those round it"]
-    if v.open_share > 0.02:
-        words.append(f"{v.open_share:.0%} of the hole is open: add views from other sides, or take the preset best")
-    if v.remains > 0.05:
-        place = f"{v.remains:.0%} of the object's place still looks like it"
-        words.append(f"{place}: enlarge the box until all of it is inside")
-    if v.haze is not None and v.haze > 0.05:
-        haze = f"haze covers {v.haze:.0%} of what was behind the object"
-        words.append(f"{haze}: enlarge the box, or add one round the haze")
-    if v.ring_fidelity is not None and v.ring_fidelity < -0.5:
-        lost = f"the surroundings lost {-v.ring_fidelity:.1f} dB against the photos"
-        words.append(f"{lost}: make the box tighter")
-    if v.sharpness is not None and not 0.5 < v.sharpness < 2:
-        detail = f"the fill has {v.sharpness:.1f} times the detail of its surroundings"
-        words.append(f"{detail}: paint one view, or try another seed")
-    if v.agreement is not None and v.agreement < 0.7:
-        alike = f"only {v.agreement:.0%} of the object's place looks as photos show it"
-        words.append(f"{alike}: mark shadows and reflections")
-    if v.invented > 0.3:
-        unknown = f"no photo shows {v.invented:.0%} of the object's place"
-        words.append(f"{unknown}: paint one view if the fill does not convince")
-    return tuple(words)
+    figures = ((getattr(v, name), low, high, words) for name, low, high, words in SOUND)
+    amiss = (words.format(abs(x)) for x, low, high, words in figures if x is not None and not low <= x <= high)
+    return f"{level}: errors where the object was are probably {times:.1f} times those round it", *amiss

@@ -101,18 +101,17 @@ def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> Refi
     h, w = mask.shape
     try:
         pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
+        if pasted.warnings:
+            raise BadInput(pasted.warnings[0])
+        drift = _drift(painted, pasted.image, mask)
+        if drift > MOST_DRIFT:
+            off = f"{drift:.0f} grey levels from what was propagated, under a blur"
+            raise BadInput(f"{who.who} painted something else: {off}")
     except BadInput as error:
         return RefinedView(view.camera_id, None, str(error))
-    if pasted.warnings:
-        return RefinedView(view.camera_id, None, pasted.warnings[0])
-    drift = _drift(painted, pasted.image, mask)
-    if drift > MOST_DRIFT:
-        words = f"{who.who} painted something else: {drift:.0f} grey levels from what was propagated, under a blur"
-        return RefinedView(view.camera_id, None, words)
     whole = view.image.copy()
     whole[part] = pasted.image
-    words = f"{drift:.0f} grey levels from what was propagated; {pasted.reason}"
-    return RefinedView(view.camera_id, whole, words)
+    return RefinedView(view.camera_id, whole, f"{drift:.0f} grey levels from what was propagated; {pasted.reason}")
 
 
 def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -122,9 +121,8 @@ def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> t
     factor = min(1.0, LONGEST / max(mask.shape))
     height, width = (max(1, round(factor * side)) for side in mask.shape)
     beside = max(1, min(LONGEST, round(reference.shape[1] * height / reference.shape[0])))
-    right = scaled(view, width, height) if factor < 1 else view
     shrunk = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
-    both = np.hstack([scaled(reference, beside, height), right])
+    both = np.hstack([scaled(reference, beside, height), scaled(view, width, height)])
     return both, np.hstack([np.zeros((height, beside), bool), shrunk]), beside
 
 

@@ -23,7 +23,6 @@ from ..progress import Progress
 from ..raster import label_weights
 from ..stages.charts import Chart, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
 from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
-from ..stages.contact import find_contact
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
 from ..stages.masks import Masks
@@ -32,7 +31,7 @@ from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.reflection import Reflection, find_reflection
 from ..stages.seed import OWN_RULES
 from ..stages.selection import Selection, near_region
-from ..stages.shadow import Shadow, find_shadow, marked_shadow
+from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
 from ..stages.witness import Witness, total_over
 from ..view_state import ViewState
 from .references import emptied
@@ -179,7 +178,7 @@ def find_light(
     if settings.shadow == "mask":
         shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
     else:
-        shadow = find_shadow(gone, planes, grounds, region)
+        shadow = find_shadow(gone, planes[0], grounds, region)
     return Found(reflection, shadow)
 
 

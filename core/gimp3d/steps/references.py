@@ -33,7 +33,7 @@ from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.reference import rim
 from ..stages.refine import looked_at
-from ..stages.seed import colour_gaussians, seed_gaussians, settle_gaussians
+from ..stages.seed import seed_gaussians, settle_gaussians
 from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
 from ..view_state import ViewState
 
@@ -264,9 +264,8 @@ def settle_seeds(
     settings: RemovalSettings,
 ) -> Gaussians:
     """The seeds that are needed, in the colours of the painted views."""
-    camera, cameras = completed.camera, [v.camera for v in views]
-    coloured = colour_gaussians(seeds, camera, cameras, painting.views, filled.sh_degree, settings.seed)
-    return settle_gaussians(filled, coloured, camera, cameras, painting.views, settings.seed)
+    cameras = [v.camera for v in views]
+    return settle_gaussians(filled, seeds, completed.camera, cameras, painting.views, settings.seed)
 
 
 def after_reference(

@@ -29,7 +29,7 @@ def prepared() -> tuple[list[Witness], Shadow]:
     photos = {c.id: render_bytes(lit.gaussians, c) for c in lit.cameras()}
     masks = find_masks(lit.gaussians, lit.region, lit.cameras(), photos=photos)
     exposures = exposures_of(lit.gaussians.take(~masks.removed), masks.views, photos)
-    views = [ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures.views)]
+    views = [ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures)]
     surfaces = find_surfaces(lit.gaussians, lit.region, masks, views, settings)
     found = find_light(lit.gaussians, lit.region, surfaces, views, {}, settings)
     assert not isinstance(found.shadow, str)
