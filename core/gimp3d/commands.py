@@ -26,21 +26,20 @@ from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, undistorted, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
-from .job import MOST_VARIANTS, RemovalJob
+from .job import MOST_VARIANTS, RemovalJob, SharedStages, StageStore
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
 from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
+from .presets import job_settings, shadow_of
 from .progress import Progress, silent
 from .raster import RasterSettings, render
 from .report import draw, write_charts, write_removal_report
 from .run import Run
-from .settings import job_settings, shadow_of
 from .stages.charts import Chart, chart_number
 from .stages.masks import MaskSettings, find_masks
 from .steps.completion import charts_to_paint
 from .steps.light import NOT_LIT
-from .store import SharedStages, StageStore
 from .summary import summary_of, variant_facts
 from .view_state import ViewState
 

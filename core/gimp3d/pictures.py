@@ -11,7 +11,7 @@ from .compute.threads import parallel_map
 from .gaussians import Gaussians
 from .geometry import window_mask
 from .raster import footprint, touched_window
-from .result import Picture
+from .run import Picture
 from .stages.charts import Chart
 from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField

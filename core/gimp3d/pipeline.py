@@ -20,8 +20,7 @@ from .priors.inpaint import check_provider, painter
 from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
-from .result import Picture, RemovalResult, StageReport, View
-from .run import Observer, Run, Store, unobserved
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
 from .stages.masks import Masks, find_masks
 from .stages.propagate import Reference
 from .stages.verdict import Verdict, judge

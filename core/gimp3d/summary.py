@@ -15,7 +15,7 @@ from .io.ply import SplatFile
 from .job import RemovalJob
 from .memory import peak_memory_mb
 from .presets import RemovalSettings
-from .result import RemovalResult
+from .run import RemovalResult
 
 
 def summary_of(

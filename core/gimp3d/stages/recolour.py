@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..gaussians import SH_C0, Gaussians
+from ..gaussians import SH_C0, Gaussians, sh_basis
 from ..geometry import directions
 from ..raster import label_weights, pixel_region
-from ..sh import sh_basis
 from .seed import missing_colours
 from .witness import Witness
 
