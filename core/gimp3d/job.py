@@ -110,19 +110,9 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
     """Read a job folder; its paths come back absolute.
 
     A job from elsewhere cannot reach out of its folder: paths that lead out, and providers that are a command, a host
-    or a model, count only if they are given again. This user's own jobs may, but for commands.
-
-    Parameters
-    ----------
-    given
-        Fields as the user gives them again, in place of the job's.
-    allow_command
-        The user knows the command that the job names, and wants it run.
-
-    Raises
-    ------
-    BadInput
-        If the folder holds no job, one that is damaged or of another version, or one that reaches out.
+    or a model, count only if the user gives them again (`given`, in place of the job's fields). This user's own jobs
+    may, but for commands, which the user has to know and want (`allow_command`). BadInput if the folder holds no job,
+    one that is damaged or of another version, or one that reaches out.
     """
     path, given = folder / "job.json", given or {}
     try:

@@ -72,13 +72,7 @@ PRESETS["paper-literal"] = replace(
 
 
 def job_settings(job: RemovalJob) -> RemovalSettings:
-    """The preset's settings with the job's own on top.
-
-    Raises
-    ------
-    BadInput
-        If a key of --set does not exist or its value is of the wrong type.
-    """
+    """The preset's settings with the job's own on top; BadInput if one does not exist, or its value is none for it."""
     if job.preset not in PRESETS:
         raise BadInput(f"--preset: {job.preset!r} is not in this version; use {', '.join(PRESETS)}")
     if not 0 <= job.seed < 1 << 32:
