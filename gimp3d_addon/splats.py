@@ -17,9 +17,8 @@ import numpy as np
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, Gaussians
+from gimp3d.gaussians import SH_C0, Gaussians, sh_basis
 from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
-from gimp3d.sh import sh_basis
 from gimp3d.srgb import decoded
 
 from .native import attribute_values, is_native, read_native, write_native

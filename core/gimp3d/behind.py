@@ -63,6 +63,8 @@ def look_behind(
 ) -> Behind:
     """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
     settings, region, lit = run.settings, masks.grown(region), NOT_LIT
+    if not masks.removed.any():
+        return Behind(scene, scene, lit.rows, masks, (), (), lit)
     exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos, words=levelled)
     views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures))
     if settings.charts is None or masks.mode != "need":

@@ -88,12 +88,9 @@ def in_region(region: Sequence[Box], points: np.ndarray) -> np.ndarray:
 
 
 def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.ndarray) -> Box:
-    """The box that a transform makes of axis-aligned bounds; any rotation, scale (also negative), translation.
+    """The box that a transform makes of axis-aligned bounds: any rotation, scale (also negative) and translation.
 
-    Raises
-    ------
-    BadInput
-        If the transform shears (rotated child of a non-uniformly scaled parent) or flattens the box.
+    BadInput if it shears (rotated child of a non-uniformly scaled parent) or flattens the box.
     """
     linear = matrix[:3, :3]
     lengths = np.linalg.norm(linear, axis=0)
@@ -109,13 +106,7 @@ def box_from_matrix(matrix: np.ndarray, bounds_min: np.ndarray, bounds_max: np.n
 
 
 def read_region(path: Path | str) -> Region:
-    """Read a ROI JSON: one box, or a list of boxes.
-
-    Raises
-    ------
-    BadInput
-        If the file is missing, is not JSON, or a box is malformed.
-    """
+    """Read a ROI JSON: one box, or a list of boxes; BadInput if it is missing, no JSON, or a box is malformed."""
     path = Path(path)
     data = read_json(path, "ROI", LARGEST_ROI)
     boxes = data if isinstance(data, list) else [data]

@@ -29,13 +29,7 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Camera:
-    """One view of the scene: world→camera pose, intrinsics in pixels, and where its photo lies.
-
-    Raises
-    ------
-    ValueError
-        If the picture has no pixels, or a number is not finite.
-    """
+    """One view of the scene: its pose, intrinsics, and where its photo lies; ValueError for numbers that are none."""
 
     id: str  # file_path / image name / img_name, as the camera file gives it
     width: int  # pixels

@@ -299,7 +299,7 @@ def _masks(given: Namespace, shown: Reporter) -> None:
 def _remove(given: Namespace, shown: Reporter) -> None:
     from .commands import run_removal
     from .pipeline import provider_notices
-    from .settings import job_settings
+    from .presets import job_settings
 
     job = _job(given)
     before = identity(Path(job.out))

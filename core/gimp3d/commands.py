@@ -20,29 +20,26 @@ from .compute.jit import announce_compilation
 from .compute.threads import parallel_map, set_thread_count
 from .errors import BadInput
 from .files import is_stream, sweep, try_target, write_atomically, write_json
-from .frame import Frame, frame_of
+from .frame import frame_of
 from .gaussians import Gaussians
 from .io.cameras import read_cameras, write_transforms
 from .io.formats import read_scene
 from .io.images import load_view, read_image, write_png
 from .io.ply import SplatFile, positions, write_gaussians, write_ply
-from .job import MOST_VARIANTS, RemovalJob
+from .job import MOST_VARIANTS, RemovalJob, SharedStages, StageStore
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
-from .pictures import of_light
-from .pipeline import RemovalResult, RemovalSettings, View, look_behind, preview, remove_object, render_bytes
+from .pictures import draw, of_light
+from .pipeline import RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
+from .presets import job_settings, shadow_of
 from .progress import Progress, silent
 from .raster import RasterSettings, render
-from .report import draw, write_charts, write_removal_report
+from .report import summary_of, write_charts, write_removal_report
 from .run import Run
-from .settings import job_settings, shadow_of
-from .stages.charts import Chart, chart_number
-from .stages.masks import MaskSettings, find_masks
-from .steps.behind import NOT_LIT
+from .stages.charts import chart_number
+from .stages.masks import MaskSettings
+from .stages.propagate.blend import to_bytes
 from .steps.references import charts_to_paint
-from .store import SharedStages, StageStore
-from .summary import summary_of, variant_facts
-from .view_state import ViewState
 
 PASSES = ("rgb", "alpha", "depth", "normal")
 
@@ -96,13 +93,7 @@ def _precise(file: SplatFile) -> Gaussians:
 def select_cameras(
     cameras: Sequence[Camera], split: str = "all", frames: Sequence[str] | None = None
 ) -> tuple[Camera, ...]:
-    """The cameras of a split, or those named (`frames` wins).
-
-    Raises
-    ------
-    BadInput
-        If a named camera does not exist or nothing is left.
-    """
+    """The cameras of a split, or those named (`frames` wins); BadInput if one does not exist or nothing is left."""
     if frames:
         by_name = {c.id: c for c in cameras}
         missing = [f for f in frames if f not in by_name]
@@ -169,9 +160,9 @@ def render_views(
         drawn = render(gaussians, frame.camera(pinhole), raster, frozenset(passes))
         name = output_name(camera.id)
         if "rgb" in passes:
-            write_png(out / f"{name}.png", to_bytes(drawn.rgb))
+            write_png(out / f"{name}.png", to_bytes(255 * drawn.rgb))
         if "alpha" in passes:
-            write_png(out / f"{name}.alpha.png", to_bytes(drawn.alpha))
+            write_png(out / f"{name}.alpha.png", to_bytes(255 * drawn.alpha))
         if "depth" in passes:
             _write_npy(out / f"{name}.depth.npy", drawn.median_depth / np.float32(frame.scale))
         if "normal" in passes:
@@ -209,39 +200,30 @@ def write_masks(
         try_target(folder, is_folder=True)
     given, region = _precise(read_scene(scene)), read_region(roi)
     available = read_cameras(cameras, _images_folder(images))
-    frame = frame_of(given, available)
-    gaussians, region = frame.scene(given), frame.region(region)
     written = select_cameras(available, split, frames)
     names = {c.id for c in written}
     looked_at = [c for c in available if c.split == "train" or c.id in names]  # in the file's order, as a removal does
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    loaded, _ = _load_views(looked_at, images, gaussians, frame)
-    photos = {v.camera.id: v.image for v in loaded}
+    loaded = _load_views(looked_at, images, given)
     masks = MaskSettings(mode=mode, grow=grow)  # type: ignore[arg-type]
-    settings = RemovalSettings(masks=masks, depth_prior=depth_prior, shadow=shadow_of(shadow, shadow_masks))
+    run = Run(RemovalSettings(masks=masks, depth_prior=depth_prior, shadow=shadow_of(shadow, shadow_masks)), progress)
     extra = _read_marks("--extra-masks", extra_masks, looked_at)
-    found = find_masks(gaussians, region, [v.camera for v in loaded], masks, progress, photos, extra)
     marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
-    views: dict[str, ViewState] = {}
-    charts: tuple[Chart, ...] = ()
-    lit = NOT_LIT
-    if found.removed.any():
-        behind = look_behind(Run(settings, progress), gaussians, region, found, photos, marked or {})
-        views = {v.id: v for v in behind.views}
-        charts, lit = charts_to_paint(behind.charts, behind.views), behind.lit
+    frame = frame_of(given, available)
+    behind = look(run, frame, given, loaded, region, extra, marked)
+    seen = {v.id: v for v in behind.views}
     if pictures:
-        write_json(pictures / "proposed.json", frame.proposed_back(found.proposed))
-        write_json(pictures / "light.json", {"shadow": lit.shadow, "reflection": lit.reflection})
+        write_json(pictures / "proposed.json", frame.proposed_back(behind.masks.proposed))
+        write_json(pictures / "light.json", {"shadow": behind.lit.shadow, "reflection": behind.lit.reflection})
         if all(c.split == "train" for c in written):
+            charts = charts_to_paint(behind.charts, behind.views)
             write_charts(pictures / "charts", frame.charts_back(charts))
     for camera in written:
-        view = views.get(camera.id)
-        name = output_name(camera.id)
+        name, view = output_name(camera.id), seen.get(camera.id)
         target = view.masks.target if view else np.zeros((camera.height, camera.width), bool)
         write_png(out / f"{name}.png", target)
         if pictures and view:
-            shown = preview(view, settings)
-            for looked in (*shown, *of_light(lit, list(views), [camera.id])):
+            for looked in (*preview(view, run.settings), *of_light(behind.lit, list(seen), [camera.id])):
                 write_png(pictures / f"{name}.{looked.kind}.png", draw(looked))
 
 
@@ -308,15 +290,17 @@ def run_removal(
     progress("read", 0, 1, job.scene)
     file = read_scene(Path(job.scene))
     region = read_region(Path(job.roi))
-    cameras = _removal_cameras(job)
+    reference = job.reference and job.reference.removeprefix("./")
+    cameras = _removal_cameras(job, reference)
     pixels = sum(c.width * c.height for c in cameras)
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
-    warnings = _scene_warnings(file)
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    given = _precise(file)
-    frame = frame_of(given, cameras)
-    scene = frame.scene(given)
-    views, rendered = _load_views(cameras, job.images, scene, frame)
+    warnings, scene = [], _precise(file)
+    if unusable := int((~file.gaussians.usable).sum()):
+        what = "Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"
+        warnings.append(f"{unusable} {what}")
+    views = _load_views(cameras, job.images, scene)
+    rendered = sum(v.camera.split == "train" and not v.is_photo for v in views)
     if rendered and job.images != "none":
         warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     picture = read_image(Path(job.reference_image)) if job.reference_image else None
@@ -325,21 +309,18 @@ def run_removal(
     progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
     key = _job_key(job, views, (extra, shadow)) if folder else ""
     shared = SharedStages(BEFORE_FILL if job.variants > 1 else ())
-    inputs, reference = (scene, views, frame.region(region)), _clean_id(job.reference)
+    given = (reference, picture, progress, shared, extra, shadow, allow_network)
     results: list[RemovalResult] = []
     for variant in range(settings.variant, settings.variant + job.variants):
         of_variant = replace(settings, variant=variant)
         if folder:
             stages = folder / "stages" / (str(variant + 1) if variant else "")
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
-        result = remove_object(*inputs, of_variant, reference, picture, progress, shared, extra, shadow, allow_network)
-        charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
-        results.append(replace(result, charts=charts, proposed=proposed))
-    summary = summary_of(job, settings, file, results[0], warnings, time.perf_counter() - start)
-    summary["variants"] = [variant_facts(path, result) for path, result in zip(job.outs(), results)]
+        results.append(remove_object(scene, views, region, of_variant, *given))
+    summary = summary_of(job, settings, file, results, warnings, time.perf_counter() - start)
     _write_beside(job, folder, scene, views, results, summary)
     for path, result in reversed(list(zip(job.outs(), results))):
-        write_ply(path, file, result.keep, frame.back(result.added))  # OUT last: as it was until all has gone well
+        write_ply(path, file, result.keep, result.added)  # OUT last: as it was until all has gone well
     return summary
 
 
@@ -374,10 +355,9 @@ def _try_targets(job: RemovalJob, folder: Path | None) -> None:
         try_target(path, is_folder=True)
 
 
-def _removal_cameras(job: RemovalJob) -> tuple[Camera, ...]:
+def _removal_cameras(job: RemovalJob, reference: str | None) -> tuple[Camera, ...]:
     """The train frames and the reference, whatever its split."""
     available = read_cameras(Path(job.cameras), _images_folder(job.images))
-    reference = _clean_id(job.reference)
     if reference and chart_number(reference) is None and reference not in {c.id for c in available}:
         raise BadInput(f"--reference: no camera {reference}; the file has {available[0].id}, {available[-1].id} …")
     if job.reference_image and not reference:
@@ -392,24 +372,19 @@ def _images_folder(images: str | None) -> Path | None:
     return Path(images) if images and images != "none" else None
 
 
-def _load_views(
-    cameras: Sequence[Camera], images: str | None, scene: Gaussians, frame: Frame
-) -> tuple[list[View], int]:
-    """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene.
+def _load_views(cameras: Sequence[Camera], images: str | None, scene: Gaussians) -> list[View]:
+    """Photos where there are any; otherwise, and for a reference outside the train split, the rendered scene."""
+    frame = frame_of(scene, cameras)
+    drawn = frame.scene(scene)
 
-    The scene and the views' cameras are in the frame, the cameras given are the file's.
-    """
-
-    def load(camera: Camera) -> tuple[View, bool]:
-        wanted = images != "none" and camera.split == "train"
-        if wanted and camera.image is not None and camera.image.exists():
+    def load(camera: Camera) -> View:
+        if images != "none" and camera.split == "train" and camera.image is not None and camera.image.exists():
             image, pinhole = load_view(camera)
-            return View(frame.camera(pinhole), image), False
-        pinhole = frame.camera(replace(camera, distortion=None))
-        return View(pinhole, render_bytes(scene, pinhole), is_photo=False), wanted
+            return View(pinhole, image)
+        pinhole = replace(camera, distortion=None)
+        return View(pinhole, render_bytes(drawn, frame.camera(pinhole)), is_photo=False)
 
-    loaded = parallel_map(load, cameras)
-    return [v for v, _ in loaded], sum(missing for _, missing in loaded)
+    return parallel_map(load, cameras)
 
 
 def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
@@ -421,13 +396,6 @@ def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera
     if not masks:
         raise BadInput(f"{option}: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
     return masks
-
-
-def _scene_warnings(file: SplatFile) -> list[str]:
-    unusable = int((~file.gaussians.usable).sum())
-    if not unusable:
-        return []
-    return [f"{unusable} Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"]
 
 
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:
@@ -462,15 +430,6 @@ def _files_of(provider: str) -> list[Path]:
     parts = rest.split(",")
     named = (Path(",".join(parts[:k])) for k in range(len(parts), 0, -1))
     return [path for path in named if path.is_file()][:1]
-
-
-def to_bytes(picture: np.ndarray) -> np.ndarray:
-    """[0, 1] floats as 8-bit values."""
-    return np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8)
-
-
-def _clean_id(name: str | None) -> str | None:
-    return name[2:] if name and name.startswith("./") else name
 
 
 def _write_npy(path: Path, array: np.ndarray) -> None:

@@ -43,13 +43,7 @@ def user_secret() -> bytes:
 
 
 def require_file(path: Path) -> Path:
-    """The path, if a file lies there or nothing does: a pipe has no end and no second reading.
-
-    Raises
-    ------
-    BadInput
-        If it is a pipe, a socket or a device.
-    """
+    """The path, if a file lies there or nothing does; BadInput for a pipe, a socket or a device."""
     if is_stream(path):
         raise BadInput(f"{path} is a pipe or a device; a file is needed, as it is read more than once")
     return path
@@ -58,12 +52,8 @@ def require_file(path: Path) -> Path:
 def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     """Let `write(file)` fill a temporary file beside `path`, then move it there; nothing half-written stays.
 
-    A link is followed and the file's permissions are kept. A pipe or a device is written to as it is.
-
-    Raises
-    ------
-    BadInput
-        If the folder cannot be written or the disk is full.
+    A link is followed and the file's permissions are kept. A pipe or a device is written to as it is. BadInput if the
+    folder cannot be written or the disk is full.
     """
     try:
         if is_stream(path):
@@ -72,7 +62,8 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
             return
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
-        name = target.with_name(f".{_short(target.name)}.{secrets.token_hex(4)}.{os.getpid()}{UNFINISHED}")
+        short = target.name.encode()[:100].decode(errors="ignore")  # no name is longer than file systems allow
+        name = target.with_name(f".{short}.{secrets.token_hex(4)}.{os.getpid()}{UNFINISHED}")
         old = target.stat() if target.exists() else None
         try:
             with open(name, "xb", opener=lambda n, flags: os.open(n, flags, 0o600 if old else 0o666)) as file:
@@ -80,7 +71,9 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             if old:
-                _take_permissions(name, old)
+                with suppress(OSError, AttributeError):  # AttributeError: Windows knows no owners
+                    os.chown(name, old.st_uid, old.st_gid)
+                name.chmod(stat.S_IMODE(old.st_mode))
             os.replace(name, target)
         except BaseException:
             with suppress(OSError):
@@ -138,24 +131,10 @@ def is_stream(path: Path) -> bool:
 
 def identity(path: Path) -> tuple[int, ...] | None:
     """Tells a file from what replaces it; None where there is none."""
-    try:
+    with suppress(OSError):
         found = os.stat(path)
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def _take_permissions(path: Path, old: os.stat_result) -> None:
-    """A new file gets the permissions, and where that is allowed the owner, of the one that it replaces."""
-    if hasattr(os, "chown"):
-        with suppress(OSError):
-            os.chown(path, old.st_uid, old.st_gid)
-    path.chmod(stat.S_IMODE(old.st_mode))
-
-
-def _short(name: str) -> str:
-    """So much of a name that a temporary one is no longer than file systems allow."""
-    return name.encode()[:100].decode(errors="ignore")
+        return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_size
+    return None
 
 
 def _alive(process: int) -> bool:

@@ -52,13 +52,8 @@ class Forecast:
         return sum(self.stages.values())
 
 
-def forecast_removal(
-    gaussians: int,
-    views: int,
-    pixels: int,  # of all views together
-    preset: str = "balanced",
-) -> Forecast:
-    """What a removal will roughly take: one chart, or one view, and a shadow that stays."""
+def forecast_removal(gaussians: int, views: int, pixels: int, preset: str = "balanced") -> Forecast:
+    """What a removal will roughly take, of `pixels` in all views: one chart, or one view, and a shadow that stays."""
     work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
     charted = preset in CHARTED
     other = ON_VIEWS if charted else ON_CHARTS

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .box import Box, Region
 from .camera import Camera
 from .gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from .stages.charts import Chart
+from .stages.charts import Chart
 
 ORDINARY = (0.5, 128.0)  # scene units: usual depths in views at which a scene keeps its units …
 USUAL = 4.0  # … and what they are in a frame of its own
@@ -53,10 +51,6 @@ class Frame:
         """Boxes of the file's frame in this one."""
         return tuple(replace(b, center=(b.center - self.origin) * self.scale, size=b.size * self.scale) for b in region)
 
-    def cameras_back(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-        """Cameras of this frame in the file's."""
-        return tuple(self._moved(c, c.t / self.scale - c.R @ self.origin) for c in cameras)
-
     def back(self, gaussians: Gaussians | None) -> Gaussians | None:
         """Gaussians of this frame in the file's, their means in float64."""
         if gaussians is None or self.is_files:
@@ -66,7 +60,8 @@ class Frame:
 
     def charts_back(self, charts: Sequence[Chart]) -> tuple[Chart, ...]:
         """Charts whose cameras are in the file's frame."""
-        return tuple(replace(c, camera=b) for c, b in zip(charts, self.cameras_back([c.camera for c in charts])))
+        pairs = [(chart, chart.camera) for chart in charts]
+        return tuple(replace(c, camera=self._moved(b, b.t / self.scale - b.R @ self.origin)) for c, b in pairs)
 
     def proposed_back(self, proposed: dict[str, Any]) -> dict[str, Any]:
         """What a removal proposes to take along, see Growth.facts."""
@@ -88,9 +83,6 @@ class Frame:
         return (gaussians.log_scales.astype(np.float64) + np.log(scale)).astype(np.float32)
 
 
-FILES = Frame(np.zeros(3), 1.0)
-
-
 def frame_of(scene: Gaussians, cameras: Sequence[Camera]) -> Frame:
     """The frame that suits a scene as these cameras see it: near the origin and of ordinary size.
 
@@ -107,7 +99,7 @@ def frame_of(scene: Gaussians, cameras: Sequence[Camera]) -> Frame:
     depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]
     usual = float(np.nanmedian(depths)) if np.isfinite(depths).any() else np.nan
     if not np.isfinite(usual) or usual <= 0:
-        return FILES
+        return Frame(np.zeros(3), 1.0)
     scale = 1.0 if ORDINARY[0] <= usual <= ORDINARY[1] else 2.0 ** -round(np.log2(usual / USUAL))
     middle = np.median(points, axis=0)
     if np.linalg.norm(middle) <= FAR * usual:

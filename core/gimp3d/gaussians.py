@@ -7,6 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 SH_C0 = 0.28209479177387814  # Y_0; 3DGS stores colour as 0.5 + SH_C0 * f_dc, gamma-encoded sRGB
+SH_C1 = 0.4886025119029199
+SH_C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+SH_C3 = (
+    *(-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154),
+    *(-0.4570457994644658, 1.445305721320277, -0.5900435899266435),
+)
 ARRAYS = ("means", "log_scales", "quats", "opacity_logits", "sh")  # what Gaussians are made of, a row each
 
 
@@ -110,3 +116,22 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     _, vectors = np.linalg.eigh(np.stack([np.stack(r, axis=-1) for r in rows], axis=-2))
     wxyz = vectors[..., -1]
     return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
+
+
+def sh_basis(
+    directions: np.ndarray,  # [..., 3] unit, from the camera to the point
+    degree: int,  # 0–3
+) -> np.ndarray:
+    """Y_k(ω) with 3DGS's signs and order, [..., (degree+1)²]."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    bands = [np.full_like(x, SH_C0)]
+    if degree > 0:
+        bands += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree > 1:
+        squares = (SH_C2[2] * (2 * z * z - x * x - y * y), SH_C2[3] * x * z, SH_C2[4] * (x * x - y * y))
+        bands += [SH_C2[0] * x * y, SH_C2[1] * y * z, *squares]
+    if degree > 2:
+        bands += [SH_C3[0] * y * (3 * x * x - y * y), SH_C3[1] * x * y * z, SH_C3[2] * y * (4 * z * z - x * x - y * y)]
+        bands += [SH_C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), SH_C3[4] * x * (4 * z * z - x * x - y * y)]
+        bands += [SH_C3[5] * z * (x * x - y * y), SH_C3[6] * x * (x * x - 3 * y * y)]
+    return np.stack(bands, -1)

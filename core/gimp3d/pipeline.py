@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,24 +14,22 @@ from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
 from .filling import Filling, ask_for_refinement, fill_hole, recolour, refine
-from .frame import frame_of
+from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .presets import PRESETS, RemovalSettings
 from .priors.inpaint import check_provider, painter
 from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
-from .result import Picture, RemovalResult, StageReport, View
-from .run import Observer, Run, Store, unobserved
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
 from .stages.masks import Masks, find_masks
-from .stages.propagate import Reference
 from .stages.verdict import Verdict, judge
 from .steps.behind import NOT_LIT, Relit
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
 from .view_state import ViewState, open_pixels
 
 __all__ = [
-    "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look_behind", "preview",
+    "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look", "preview",
     "provider_notices", "remove_object", "render_bytes",
 ]  # fmt: skip
 REFINERS = ("command", "http", "https")  # who may be asked to refine views
@@ -83,40 +82,49 @@ def remove_object(
     (False, True)
     """
     frame = frame_of(scene, [v.camera for v in views])
-    result = _remove(
-        Run(settings, progress, store, allow_network, observer),
-        frame.scene(scene),
-        [replace(v, camera=frame.camera(v.camera)) for v in views],
-        frame.region(region),
-        reference,
-        reference_image,
-        extra_masks,
-        shadow_masks,
-    )
+    run = Run(settings, progress, store, allow_network, observer)
+    for notice in provider_notices(settings, allow_network):
+        progress("read", 0, 1, notice)
+    behind = look(run, frame, scene, views, region, extra_masks or {}, shadow_masks or {})
+    result = _filled(run, views, behind, reference, reference_image)
     charts, proposed = frame.charts_back(result.charts), frame.proposed_back(result.proposed)
     return replace(result, added=frame.back(result.added), charts=charts, proposed=proposed)
 
 
-def _remove(
+def look(
     run: Run,
+    frame: Frame,  # in which the result is; all else is in the file's
     scene: Gaussians,
     views: Sequence[View],
     region: Region,
-    reference: str | None,
-    reference_image: np.ndarray | None,
-    extra_masks: Mapping[str, np.ndarray] | None,
-    shadow_masks: Mapping[str, np.ndarray] | None,
+    extra_masks: Mapping[str, np.ndarray],
+    shadow_masks: Mapping[str, np.ndarray],
+) -> Behind:
+    """What goes, what that leaves open in every view, and what is behind it."""
+    scene, region = frame.scene(scene), frame.region(region)
+    cameras, photos = [frame.camera(v.camera) for v in views], {v.camera.id: v.image for v in views}
+    for camera in cameras:
+        if camera.width < 1 or camera.height < 1:
+            raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
+    settings = run.settings.masks
+    if run.settings.charts is None:  # nothing else tells T then
+        settings = replace(settings, mode="paper")
+    masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra_masks)
+    run.warnings += masks.warnings
+    if masks.removed.any() and masks.left_out:
+        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    return look_behind(run, scene, region, masks, photos, shadow_masks)
+
+
+def _filled(
+    run: Run, views: Sequence[View], behind: Behind, reference: str | None, reference_image: np.ndarray | None
 ) -> RemovalResult:
-    """The removal of a scene of ordinary size near the origin."""
-    settings = run.settings
-    for notice in provider_notices(settings, run.allow_network):
-        run.progress("read", 0, 1, notice)
-    masks = _find_object(run, scene, views, region, extra_masks)
+    """The result with the hole filled, as far as there is one."""
+    settings, masks = run.settings, behind.masks
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
-        return _result(run, masks, NOT_LIT, {})
-    behind = look_behind(run, scene, region, masks, {v.camera.id: v.image for v in views}, shadow_masks or {})
-    masks, to_paint = behind.masks, charts_to_paint(behind.charts, behind.views)
+        return _result(run, masks, NOT_LIT)
+    to_paint = charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
     run.pictures += pictures.of_charts(to_paint)
     run.pictures += pictures.of_growth(behind.scene, masks, behind.views)
@@ -138,12 +146,15 @@ def _remove(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
-    verdict = _judge(run, views, behind, filling, filling.done[0] if filling.done and by_picture else None)
+    verdict = _judge(run, views, behind, filling, by_picture)
     completed = {r.camera.id: r.image for r in filling.done}
-    result = replace(
-        _result(run, masks, behind.lit, _painted(filling, behind.lit) if masks.hole_pixels else {}),
+    result = _result(
+        run,
+        masks,
+        behind.lit,
         added=filling.added,
         open_pixels=left,
+        painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
         charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
         verdict=verdict,
         refined_views=filling.asked,
@@ -151,32 +162,8 @@ def _remove(
     return _with_changed(result, behind)
 
 
-def _find_object(
-    run: Run, scene: Gaussians, views: Sequence[View], region: Region, extra: Mapping[str, np.ndarray] | None
-) -> Masks:
-    """What goes, and what that leaves open in every view."""
-    cameras, photos = [v.camera for v in views], {v.camera.id: v.image for v in views}
-    for camera in cameras:
-        if camera.width < 1 or camera.height < 1:
-            raise BadInput(f"camera {camera.id}: a picture of {camera.width}×{camera.height} pixels")
-    settings = run.settings.masks
-    if run.settings.charts is None:  # nothing else tells T then
-        settings = replace(settings, mode="paper")
-    masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra)
-    run.warnings += masks.warnings
-    if masks.removed.any() and masks.left_out:
-        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
-    return masks
-
-
-def _judge(
-    run: Run,
-    views: Sequence[View],
-    behind: Behind,
-    filling: Filling,
-    truth: Reference | None,  # a reference whose picture was given: what the result is held against
-) -> Verdict | None:
-    """How good the result probably is."""
+def _judge(run: Run, views: Sequence[View], behind: Behind, filling: Filling, by_picture: bool) -> Verdict | None:
+    """How good the result probably is; a reference whose picture was given is what it is held against."""
     return run(
         "verdict",
         judge,
@@ -188,7 +175,7 @@ def _judge(
         {v.camera.id for v in views if v.is_photo},
         behind.charts,
         {v.id: v.hits for v in filling.views if v.hits is not None},
-        truth,
+        filling.done[0] if filling.done and by_picture else None,
         words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
     )
 
@@ -196,10 +183,7 @@ def _judge(
 def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
     """What providers send where and what that costs, to be said before they do.
 
-    Raises
-    ------
-    BadInput
-        If a provider would fail after minutes: it is unknown, lacks a file or a library, or is not allowed.
+    BadInput if one would fail after minutes: it is unknown, lacks a file or a library, or is not allowed.
     """
     run = Run(settings, silent, allow_network=allow_network)
     notices = [check_provider(settings.inpaint, run.call("--inpaint", "read"))]
@@ -216,11 +200,11 @@ def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> 
 def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     """ID → the view's photo, at its own exposure, with what the removal changed of it."""
 
-    def finished(pair: tuple[int, ViewState]) -> np.ndarray:
-        number, v = pair
+    def finished(number: int) -> np.ndarray:
+        v = filling.views[number]
         return v.exposure.back(v.painted, v.photo, v.masks.silhouette | v.masks.target | lit.shaded(number))
 
-    return dict(zip((v.id for v in filling.views), parallel_map(finished, enumerate(filling.views))))
+    return dict(zip((v.id for v in filling.views), parallel_map(finished, range(len(filling.views)))))
 
 
 def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
@@ -235,14 +219,13 @@ def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
     return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
 
 
-def _result(run: Run, masks: Masks, lit: Relit, painted: dict[str, np.ndarray]) -> RemovalResult:
+def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, **more: Any) -> RemovalResult:
     return RemovalResult(
         keep=~masks.removed,
-        added=None,
+        added=added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
-        painted=painted,
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings),
@@ -251,6 +234,7 @@ def _result(run: Run, masks: Masks, lit: Relit, painted: dict[str, np.ndarray]) 
         shadow=lit.shadow,
         reflection=lit.reflection,
         lifted=int((~masks.removed)[lit.rows].sum()),
+        **more,
     )
 
 

@@ -1,11 +1,15 @@
-"""Every stage's settings for a removal, and the presets: how much work is spent, and the paper as it is."""
+"""Every stage's settings: presets (how much work, and the paper as it is), and on top what a job and its --set say."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
-from .schema import Seed, Share, Variant
+from .errors import BadInput
+from .job import SHADOWS, RemovalJob
+from .schema import Seed, Share, Variant, within
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
 from .stages.depth import DepthSettings
@@ -65,3 +69,58 @@ PRESETS["paper-literal"] = replace(
     mapping=replace(_PAPER.mapping, visibility=-_PAPER.mapping.visibility, as_printed=True),
     seed=replace(_PAPER.seed, grey=0.0, harmonics=replace(_PAPER.seed.harmonics, anchored=False)),
 )
+
+
+def job_settings(job: RemovalJob) -> RemovalSettings:
+    """The preset's settings with the job's own on top; BadInput if one does not exist, or its value is none for it."""
+    if job.preset not in PRESETS:
+        raise BadInput(f"--preset: {job.preset!r} is not in this version; use {', '.join(PRESETS)}")
+    if not 0 <= job.seed < 1 << 32:
+        raise BadInput(f"--seed must be from 0 to {2**32 - 1}, got {job.seed}")
+    preset, shadow = PRESETS[job.preset], shadow_of(job.shadow, job.shadow_masks)
+    if preset.shadow == "off" and shadow == "mask":
+        raise BadInput(f"--shadow mask: the preset {job.preset} leaves shadows alone; use another preset")
+    settings = replace(
+        preset,
+        masks=replace(preset.masks, grow=job.grow),
+        inpaint=job.inpaint,
+        depth_prior=job.depth_prior,
+        shadow="off" if preset.shadow == "off" else shadow,
+        random_seed=job.seed,
+        refine_views=job.refine_views or "",
+    )
+    for key, text in job.set.items():
+        settings = _with(settings, key.split("."), text, key)
+    within(settings, "--set: ")
+    return settings
+
+
+def shadow_of(shadow: str, masks: Path | str | None) -> Any:
+    """The setting `shadow`; raises BadInput if masks of a shadow are given without `mask`, or the other way round."""
+    if shadow not in SHADOWS:
+        raise BadInput(f"--shadow: {shadow!r} is not one of {', '.join(SHADOWS)}")
+    if (shadow == "mask") != (masks is not None):
+        raise BadInput("--shadow mask and --shadow-masks DIR go together")
+    return shadow
+
+
+def _with(settings: Any, path: Sequence[str], text: str, key: str) -> Any:
+    (name, *rest), names = path, [f.name for f in fields(settings)]
+    if name not in names:
+        raise BadInput(f"--set: no setting {key!r}; {type(settings).__name__} has {', '.join(names)}")
+    value = getattr(settings, name)
+    if is_dataclass(value) != bool(rest):
+        raise BadInput(f"--set: {key!r} is not a single setting")
+    try:
+        new = _with(value, rest, text, key) if rest else _parse_like(value, text)
+    except (KeyError, ValueError):
+        raise BadInput(f"--set: {key} takes a {type(value).__name__}, got {text!r}") from None
+    return replace(settings, **{name: new})
+
+
+def _parse_like(value: Any, text: str) -> Any:
+    if isinstance(value, bool):
+        return {"true": True, "1": True, "false": False, "0": False}[text.lower()]
+    if value is None:
+        return None if text == "none" else float(text)
+    return type(value)(text)

@@ -1,37 +1,34 @@
-"""A one-page HTML report of a removal: before and after, what each stage saw, how long it took."""
+"""What is told of a removal: a summary as JSON, and a page with pictures of before and after and of every stage."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any, NamedTuple
+from typing import Any
 
-import cv2
 import numpy as np
 
+from . import __version__
 from .files import write_atomically
+from .frame import frame_of
 from .gaussians import Gaussians
-from .geometry import disparity_of
 from .io.cameras import write_transforms
 from .io.images import write_png
-from .pipeline import Picture, RemovalResult, View, render_bytes
+from .io.ply import SplatFile
+from .job import RemovalJob
+from .memory import peak_memory_mb
+from .pictures import RULE_COLOURS, draw
+from .presets import RemovalSettings
 from .progress import count_words
+from .raster import render_bytes
+from .run import RemovalResult, View
 from .stages.charts import Chart
-from .stages.propagate import Rule
 from .stages.reference import ReferenceChoice
 
-RULE_COLOURS = {
-    Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
-    Rule.OWN_PIXELS: ("fitted to this view's own pixels, or (paper) mapped from them", (70, 120, 220)),
-    Rule.RETARGETED: ("this view's own pixels, found near the mapped ones", (60, 190, 220)),
-    Rule.OTHER_VIEW: ("the mapped source as another view shows it", (160, 90, 200)),
-    Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
-    Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
-}
 MEANINGS = {  # of the verdict's figures
     "open_share": "share of the hole that stays open",
     "remains": "share of the object's pixels that still look like it",
@@ -44,7 +41,6 @@ MEANINGS = {  # of the verdict's figures
 }
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
-PLOT_LOW, PLOT_HIGH = 56, 424  # px between which a plot of 480 px has its axes
 STYLE = """
 :root{color-scheme:light dark;--edge:#8884;--accent:#3b82f6}
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem}
@@ -82,16 +78,94 @@ $charts$references
 TURN = "[...nextElementSibling.children].forEach((page, k) => page.hidden = k != value)"  # of the flip-book's slider
 
 
+def summary_of(
+    job: RemovalJob,
+    settings: RemovalSettings,
+    file: SplatFile,
+    results: Sequence[RemovalResult],  # of every variant
+    warnings: Sequence[str],
+    seconds: float,
+) -> dict[str, Any]:
+    """What `--summary` writes; its keys are an interface: the page, Blender's panel and others' scripts read them."""
+    result = results[0]
+    removed, added = int((~result.keep).sum()), len(result.added) if result.added else 0
+    return {
+        "version": __version__,
+        "command": "remove",
+        "seconds_total": round(seconds, 3),
+        "stages": [asdict(s) for s in result.stages],
+        "counts": {
+            "gaussians_in": len(file.gaussians),
+            "removed": removed,
+            "added": added,
+            "gaussians_out": len(file.gaussians) - removed + added,
+            "lifted": result.lifted,
+            "changed": result.changed,
+            **_cost(file, result.added),
+            "views": result.views,
+            "hole_pixels": result.hole_pixels,
+            "open_pixels": result.open_pixels,
+        },
+        "verdict": asdict(result.verdict) if result.verdict else None,
+        "selection": result.selection,
+        "proposed": result.proposed,
+        "shadow": result.shadow,
+        "reflection": result.reflection,
+        "charts": [
+            {
+                "kind": chart.kind,
+                "texels": int(chart.there.sum()),
+                "hole_texels": int(chart.hole.sum()),
+                "photos_median": float(np.median(chart.photos[chart.known])) if chart.known.any() else 0.0,
+            }
+            for chart in result.charts
+        ],
+        "refined_views": result.refined_views,
+        "references": [asdict(choice) for choice in result.references],
+        "settings": {"preset": job.preset, "reference": job.reference, **asdict(settings)},
+        "warnings": [*warnings, *result.warnings],
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "variants": [
+            {
+                "out": str(out),
+                "added": len(variant.added) if variant.added else 0,
+                "changed": variant.changed,
+                "open_pixels": variant.open_pixels,
+                "score": variant.verdict.score if variant.verdict else None,
+            }
+            for out, variant in zip(job.outs(), results)
+        ],
+    }
+
+
+def _cost(file: SplatFile, added: Gaussians | None) -> dict[str, int]:
+    """What the new Gaussians need: bytes in the file (binary ones), and how many use which SH degree."""
+    if added is None or not len(added):
+        return {}
+    used = (added.sh != 0).any(2)
+    highest = np.ceil(np.sqrt(used.shape[1] - used[:, ::-1].argmax(1))).astype(int) - 1
+    degrees = np.where(used.any(1), highest, 0)
+    cost = {f"added_of_degree_{d}": int((degrees == d).sum()) for d in range(added.sh_degree + 1)}
+    if file.table.format == "ascii":
+        return cost
+    return {"added_bytes": len(added) * file.table.rows.dtype.itemsize, **cost}
+
+
 def write_removal_report(
     folder: Path, scene: Gaussians, views: Sequence[View], variants: Sequence[RemovalResult], summary: dict[str, Any]
 ) -> Path:
     """Write index.html and its pictures into `folder`; returns the page's path."""
     result, after = variants[0], _filled(scene, variants[0])
+    frame = frame_of(scene, [v.camera for v in views])
+
+    def write_drawn(name: str, gaussians: Gaussians, view: View) -> None:
+        write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
+
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
     for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
         names = (f"before_{k}.png", f"after_{k}.png")
         for name, gaussians in zip(names, (scene, after)):
-            write_png(folder / name, render_bytes(gaussians, view.camera))
+            write_drawn(name, gaussians, view)
         pair = f"<div class=flip><img src='{names[0]}' alt='before'><img src='{names[1]}' alt='after'></div>"
         parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
@@ -101,7 +175,7 @@ def write_removal_report(
     if len(variants) > 1:
         view = max(views, key=lambda v: _touched(v, result))
         for k, variant in enumerate(variants, 1):
-            write_png(folder / f"variant_{k}.png", render_bytes(_filled(scene, variant), view.camera))
+            write_drawn(f"variant_{k}.png", _filled(scene, variant), view)
             parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
@@ -138,129 +212,6 @@ def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
         write_png(folder / f"{number}.hole.png", chart.hole)
     cameras = [replace(chart.camera, id=f"{number}.png", split="test") for number, chart in enumerate(charts, 1)]
     write_transforms(folder / "transforms.json", cameras)
-
-
-def draw(picture: Picture) -> np.ndarray:
-    """A stage's result as a picture, [H, W, 3] uint8."""
-    image, data = picture.image, picture.data
-    if picture.kind in ("mask", "chart"):
-        return tinted(image, data[0], (230, 60, 60))
-    if picture.kind == "shadow":
-        light, lifted = data
-        return np.hstack([image, np.repeat(light[..., None], 3, axis=2), lifted])
-    if picture.kind == "refined":
-        return np.hstack([data[0], image])
-    if picture.kind == "rules":
-        marked = image
-        for rule, (_, colour) in RULE_COLOURS.items():
-            marked = tinted(marked, data[0] == rule, colour, 0.35)
-        return np.hstack([data[1], image, marked])
-    if picture.kind == "mapping":
-        return offset_colours(image, *data)
-    if picture.kind == "depth":
-        return relief(*data)
-    return fit_plot(*data) if picture.kind == "fit" else outlined(image, data[0])
-
-
-def tinted(
-    image: np.ndarray,  # [H, W, 3] uint8
-    mask: np.ndarray,  # [H, W] bool
-    colour: tuple[int, int, int],
-    strength: float = 0.5,
-) -> np.ndarray:
-    """The image with a colour laid over the mask."""
-    mixed = (1 - strength) * image + strength * np.array(colour)
-    return np.where(mask[..., None], mixed, image).astype(np.uint8)
-
-
-def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The image with the mask's outline drawn on it."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(image.copy(), contours, -1, (230, 60, 60), 1)
-
-
-def relief(
-    depth: np.ndarray,  # [H, W] z, 0 = nothing
-    mask: np.ndarray,  # [H, W] bool, outlined
-) -> np.ndarray:
-    """Depth as colour, shaded like a relief."""
-    disparity, there = disparity_of(depth).astype(np.float64), depth > 0
-    low, high = np.percentile(disparity[there], [2, 98]) if there.any() else (0.0, 1.0)
-    span = max(high - low, 1e-12)
-    levels = (np.clip((disparity - low) / span, 0, 1) * 255).astype(np.uint8)
-    shade = np.clip(1 + 12 * np.gradient(disparity, axis=0) / span, 0.6, 1.3)[..., None]
-    shaded = np.clip(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1] * shade, 0, 255)
-    return outlined(np.where(there[..., None], shaded, 40).astype(np.uint8), mask)
-
-
-class FitAxes(NamedTuple):
-    """Where a plot shows (prior, disparity): nearly all pairs fill it, outliers stay outside."""
-
-    first: np.ndarray  # [2] at its lower left corner
-    last: np.ndarray  # [2] at its upper right one
-
-    @classmethod
-    def around(cls, ring: np.ndarray) -> FitAxes:
-        low, high = np.percentile(ring, [1, 99], axis=0)
-        half = np.maximum(high - low, 1e-9) / 2 * 1.1
-        return cls((low + high) / 2 - half, (low + high) / 2 + half)
-
-    def place(self, points: np.ndarray) -> np.ndarray:
-        """Pixels [..., 2] of (prior, disparity)."""
-        share = (points - self.first) / (self.last - self.first)
-        return PLOT_LOW + (PLOT_HIGH - PLOT_LOW) * np.stack([share[..., 0], 1 - share[..., 1]], -1)
-
-    def line(self, line: np.ndarray) -> np.ndarray:
-        """Pixels [2, 2] of the ends of the line disparity = slope · prior + offset."""
-        return self.place(np.array([(m, line[0] * m + line[1]) for m in (self.first[0], self.last[0])]))
-
-
-def fit_plot(
-    ring: np.ndarray,  # [N, 2] (prior, scene's disparity) of pixels round the hole
-    line: np.ndarray,  # [2] (slope, offset) fitted to them
-    scale: np.ndarray,  # s_f, one number: the slope as far as the prior is believed; 0 = it is not used
-) -> np.ndarray:
-    """How s_f was measured: the scene's disparity over the prior, and the line fitted; [size, size, 3] uint8."""
-    ink, faint, dots, drawn_line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
-    low, high, axes = PLOT_LOW, PLOT_HIGH, FitAxes.around(ring)
-    drawn = np.full((low + high, low + high, 3), 255, np.uint8)
-
-    def write(words: str, x: int, y: int, size: float = 0.38, colour: tuple[int, ...] = ink, width: int = 1) -> None:
-        cv2.putText(drawn, words, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
-
-    for share in (0, 0.25, 0.5, 0.75, 1):
-        at = round(low + share * (high - low))
-        value = axes.first + share * (axes.last - axes.first)
-        cv2.line(drawn, (at, low), (at, high), faint, 1)
-        cv2.line(drawn, (low, low + high - at), (high, low + high - at), faint, 1)
-        write(f"{value[0]:.3g}", at - 20, high + 20)
-        write(f"{value[1]:.3g}", 6, low + high - at + 4)
-    inside = ((ring >= axes.first) & (ring <= axes.last)).all(1)
-    for x, y in np.rint(axes.place(ring[inside])).astype(int):
-        cv2.circle(drawn, (int(x), int(y)), 1, dots, -1, cv2.LINE_AA)
-    fitted = axes.line(line)
-    if np.abs(fitted).max() < 1e6:  # OpenCV's coordinates are short
-        start, end = ((round(float(x)), round(float(y))) for x, y in fitted)
-        seen, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), start, end)
-        if seen:
-            cv2.line(drawn, start, end, drawn_line, 2, cv2.LINE_AA)
-    words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
-    write(f"{words} (fitted {float(line[0]):.3g})", low, 24, 0.55, drawn_line, 2)
-    write("prior", (low + high) // 2 - 16, high + 44, 0.45)
-    write("disparity of the scene", 6, 46, 0.45)
-    return drawn
-
-
-def offset_colours(image: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-    """Offsets of a mapping field: hue is the direction, brightness the length."""
-    y, x = np.mgrid[: rows.shape[0], : rows.shape[1]]
-    dy, dx = (rows - y).astype(np.float32), (cols - x).astype(np.float32)
-    length, angle = np.hypot(dx, dy), np.degrees(np.arctan2(dy, dx)) % 360
-    there = rows >= 0
-    longest = max(1.0, float(length[there].max())) if there.any() else 1.0
-    hsv = np.stack([angle / 2, np.full_like(angle, 200), 80 + 175 * np.clip(length / longest, 0, 1)], -1)
-    colour = cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB)
-    return np.where(there[..., None], colour, image // 2)
 
 
 def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalResult) -> str:

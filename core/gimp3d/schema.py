@@ -49,13 +49,7 @@ PLAIN: dict[type, str] = {list: "a list", dict: "a mapping", bool: "true or fals
 
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> Any:
-    """A JSON file's document.
-
-    Raises
-    ------
-    BadInput
-        If it cannot be read, is too large, or is not JSON that a person or program could mean.
-    """
+    """A JSON file's document; BadInput if it cannot be read, is too large, or is no JSON that anybody could mean."""
     try:
         if not path.is_file() and path.exists():
             raise BadInput(f"{what}: {path} is not a file")
@@ -87,10 +81,7 @@ def checked(
 ) -> Any:
     """A JSON value as the type that is expected: numbers, str, bool, Literal, unions with None, mappings, dataclasses.
 
-    Raises
-    ------
-    BadInput
-        If it is of another type or out of bounds.
+    BadInput if it is of another type or out of bounds.
     """
     origin, arguments = _parts(kind)
     if kind is Any:

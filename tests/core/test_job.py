@@ -14,8 +14,7 @@ import pytest
 
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
-from gimp3d.job import RemovalJob, load_job, save_job, write_atomically
-from gimp3d.store import StageStore
+from gimp3d.job import RemovalJob, StageStore, load_job, save_job, write_atomically
 
 
 def test_paths_inside_the_folder_move_with_it(tmp_path: Path) -> None:

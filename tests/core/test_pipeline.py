@@ -100,7 +100,7 @@ def test_a_library_call_takes_a_scene_in_any_units_and_anywhere(scale: float, sh
     for part in ("means", "log_scales"):
         spread, expected = (np.percentile(getattr(g, part), [5, 50, 95], 0) for g in (back, home.added))
         np.testing.assert_allclose(spread, expected, atol=0.02)
-    (chart,) = elsewhere.cameras_back([there.charts[0].camera])
+    chart = elsewhere.charts_back(there.charts)[0].camera
     np.testing.assert_allclose(chart.centre, home.charts[0].camera.centre, atol=1e-3)
 
 

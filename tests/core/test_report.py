@@ -11,8 +11,9 @@ import pytest
 from scenes import REGION, cameras, scene
 
 from gimp3d.io.images import read_image
+from gimp3d.pictures import PLOT_HIGH, PLOT_LOW, FitAxes, draw
 from gimp3d.pipeline import Picture, RemovalSettings, View, remove_object, render_bytes
-from gimp3d.report import PLOT_HIGH, PLOT_LOW, FitAxes, draw, write_removal_report
+from gimp3d.report import write_removal_report
 from gimp3d.stages.propagate import Rule
 
 IMAGE = np.full((20, 30, 3), 90, np.uint8)

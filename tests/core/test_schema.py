@@ -13,8 +13,8 @@ import pytest
 from gimp3d.errors import BadInput
 from gimp3d.job import RemovalJob
 from gimp3d.pipeline import PRESETS, RemovalSettings
+from gimp3d.presets import job_settings
 from gimp3d.schema import Between, Share, checked, kinds, parse_json, read_json, within
-from gimp3d.settings import job_settings
 
 
 @dataclass(frozen=True)

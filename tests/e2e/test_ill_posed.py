@@ -27,12 +27,11 @@ from gimp3d import pipeline
 from gimp3d.box import Box, Region
 from gimp3d.camera import Camera, Distortion
 from gimp3d.cli import Reporter, main
-from gimp3d.gaussians import SH_C0, Gaussians
+from gimp3d.gaussians import SH_C0, Gaussians, sh_basis
 from gimp3d.io.cameras import write_transforms
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import footprint, render
-from gimp3d.sh import sh_basis
 from gimp3d.stages.mapping import mapping_field
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.reference import choose_reference

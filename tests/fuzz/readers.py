@@ -38,14 +38,13 @@ from gimp3d.io.cameras import camera_id, read_cameras
 from gimp3d.io.formats import _from_sog, read_scene
 from gimp3d.io.images import load_view, read_image
 from gimp3d.io.ply import header_of, write_gaussians
-from gimp3d.job import RemovalJob, load_job, save_job
+from gimp3d.job import RemovalJob, StageStore, load_job, save_job
+from gimp3d.presets import job_settings
 from gimp3d.priors import servers
 from gimp3d.priors.monodepth import _from_file
 from gimp3d.priors.networks import read_onnx
 from gimp3d.priors.servers import _Automatic, _Comfy, _said, _Server, _workflow
 from gimp3d.schema import checked, parse_json
-from gimp3d.settings import job_settings
-from gimp3d.store import StageStore
 
 EXPECTED = (Gimp3dError, MemoryError)  # MemoryError: refused before it was taken, see gimp3d.memory
 NASTY: tuple[Any, ...] = (

@@ -7,16 +7,15 @@ import math
 import numpy as np
 from numba import float32
 
-from .. import sh
 from ..compute.jit import exact_kernel
 from ..compute.simd import store1
-from ..gaussians import SH_C0
+from ..gaussians import SH_C0, SH_C1, SH_C2, SH_C3
 from .staging import CHUNK, X, load3, store3
 
-# The magnitudes of sh.py's factors
-C0, C1 = np.float32(SH_C0), np.float32(sh.C1)
-C2 = tuple(np.float32(abs(sh.C2[k])) for k in (0, 2, 4))
-C3 = tuple(np.float32(abs(sh.C3[k])) for k in (0, 1, 2, 3, 5))
+# The magnitudes of gaussians.py's factors
+C0, C1 = np.float32(SH_C0), np.float32(SH_C1)
+C2 = tuple(np.float32(abs(SH_C2[k])) for k in (0, 2, 4))
+C3 = tuple(np.float32(abs(SH_C3[k])) for k in (0, 1, 2, 3, 5))
 TWO, THREE, FOUR = np.float32(2), np.float32(3), np.float32(4)
 SH_X = 16 * CHUNK  # the first of three planes with the direction, after 16 planes of the SH basis
 BASIS_PLANES = 19

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..gaussians import SH_C0
-from ..sh import sh_basis
+from ..gaussians import SH_C0, sh_basis
 
 COLLINEAR = 1e-3  # least ratio of the variances of the directions across and along their main axis
 SAME = 2e-5  # mean squared distance of directions from their own: below it (0.3°), they are one

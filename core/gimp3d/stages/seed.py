@@ -12,11 +12,10 @@ import numpy as np
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
-from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh
+from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, sh_basis
 from ..geometry import SAME_DEPTH, bounds, cropped, directions, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
-from ..sh import sh_basis
 from ..solvers.harmonics import HarmonicsSettings, Seen, fit_harmonics
 from .propagate import PaintedView, Rule
 

@@ -12,9 +12,8 @@ from property_tests import examples
 from test_raster_render import CAMERA, one, posed, random_scene
 
 from gimp3d.camera import Camera
-from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices
+from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices, sh_basis
 from gimp3d.raster import PASSES, RasterSettings, Rendering, contributions, footprint, render
-from gimp3d.sh import sh_basis
 
 torch = pytest.importorskip("torch")
 from torch_reference import Pictures, draw  # noqa: E402 (needs torch)

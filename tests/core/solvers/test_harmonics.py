@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from property_tests import examples
 from scipy.special import sph_harm_y
 
-from gimp3d.gaussians import SH_C0
-from gimp3d.sh import sh_basis
+from gimp3d.gaussians import SH_C0, sh_basis
 from gimp3d.solvers.harmonics import HarmonicsSettings, Seen, fit_harmonics
 
 

@@ -15,10 +15,9 @@ from scenes import cameras, floor, truth
 
 from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, Gaussians, pad_sh, quats_to_matrices
+from gimp3d.gaussians import SH_C0, Gaussians, pad_sh, quats_to_matrices, sh_basis
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
-from gimp3d.sh import sh_basis
 from gimp3d.solvers.harmonics import HarmonicsSettings
 from gimp3d.stages.propagate import PaintedView, Rule, ViewToPaint
 from gimp3d.stages.seed import (

@@ -10,11 +10,11 @@ import pytest
 from pictures import disc, error, scenery
 
 from gimp3d.errors import BadInput
+from gimp3d.job import StageStore
 from gimp3d.priors.calls import Call, Painter
 from gimp3d.priors.pasting import window_round_hole
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
-from gimp3d.store import StageStore
 
 TRUTH, HOLE = scenery(120, 160), disc()
 REFERENCE = scenery(90, 200, seed=1)
