@@ -15,11 +15,12 @@ import numpy as np
 
 from ..camera import Camera
 from ..gaussians import Gaussians
+from ..geometry import Window
 from . import cpu
 from .cpu import Trace
 from .cpu_drawing import Drawing
 from .region import PixelRegion, RegionTrace
-from .types import ALL_PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
+from .types import ALL_PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering
 from .types import PASSES as PASSES
 
 
@@ -30,8 +31,7 @@ class Backend:
     drawing = Drawing
     pixel_region = PixelRegion
     trace = staticmethod(cpu.trace)
-    contributions = staticmethod(cpu.contributions)
-    label_weights = staticmethod(cpu.label_weights)
+    weigh = staticmethod(cpu.weigh)
     touched_window = staticmethod(cpu.touched_window)
 
 
@@ -209,7 +209,9 @@ def contributions(
     >>> bool((weights.peak <= weights.total + 1e-6).all())
     True
     """
-    return current_backend().contributions(gaussians, camera, settings, pixels)
+    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
+    total, peak = current_backend().weigh(gaussians, camera, settings, labels, 1, None)
+    return Contributions(total[0], peak)
 
 
 def label_weights(
@@ -220,7 +222,7 @@ def label_weights(
     `labels` [H, W] are 0 where weights do not count, else 1 … count. Where `rows` [N] bool are given, only theirs are
     needed; others may come out too small.
     """
-    return current_backend().label_weights(gaussians, camera, labels, count, rows)
+    return current_backend().weigh(gaussians, camera, RasterSettings(), labels, count, rows)[0]
 
 
 def touched_window(gaussians: Gaussians, camera: Camera, margin: int = 0) -> Window:

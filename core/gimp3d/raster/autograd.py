@@ -40,18 +40,9 @@ def rasterize(
 ) -> Pictures:
     """Draw Gaussians so that a loss on the pictures flows back to them.
 
-    Parameters
-    ----------
-    means, log_scales, quats, opacity_logits, sh
-        Raw values as in `Gaussians`, contiguous float32 tensors on the CPU. They must not be changed in place between
-        forward and backward: torch checks that.
-    view
-        A camera; or a pixel region: then its own settings and passes count, and its frozen Gaussians are drawn along.
-
-    Raises
-    ------
-    ValueError
-        If a tensor is of another type, on another device or not contiguous (it would have to be copied).
+    The tensors are raw values as in `Gaussians`, and must not be changed in place between forward and backward: torch
+    checks that. Where `view` is a pixel region, its own settings and passes count, and its frozen Gaussians are drawn
+    along. A ValueError if a tensor is not float32, on the CPU and contiguous: it would have to be copied.
     """
     tensors = (means, log_scales, quats, opacity_logits, sh)
     for name, t in zip(ARRAYS, tensors):

@@ -12,12 +12,12 @@ from ..camera import Camera
 from ..compute.jit import announce_compilation
 from ..compute.threads import parallel_map, run_ranges, thread_count
 from ..gaussians import ARRAYS, Gaussians
-from ..geometry import bounds
+from ..geometry import Window, bounds
 from ..geometry import pack_camera as pack_pinhole
 from .bin import TileLists, mark_touched, tile_lists
 from .blend import BLOCK, CHECK, TILE_STATE, blend_range, gather_weights, weigh_range
 from .project import DEPTH, DRAWN, ELLIPSE_ROW, HALF_LOG2E, SURFEL_ROW, TILE, Projected, project_range
-from .types import PASSES, Contributions, Gradients, Mask, PictureGradients, RasterSettings, Rendering, Window
+from .types import PASSES, Gradients, Mask, PictureGradients, RasterSettings, Rendering
 from .unblend import RECORD, unblend_range
 from .unproject import unproject_range
 
@@ -158,14 +158,13 @@ class Trace:
             if picture.size and picture.shape != expected:
                 raise ValueError(f"gradient of {name}: expected shape {expected}, got {picture.shape}")
         given = tuple(padded(picture, camera) for picture in pictures.values())
-        flags = tuple(given[k].size > 0 for k in (0, 2, 3, 4))
-        names = ("rgb", "expected_depth", "median_depth", "normals")
-        missing = [name for name, wanted, drawn in zip(names, flags, self.flags) if wanted and not drawn]
+        wanted = {name: picture.size > 0 for name, picture in pictures.items() if name != "alpha"}
+        missing = [name for name, drawn in zip(wanted, self.flags) if wanted[name] and not drawn]
         if missing:
             raise ValueError(f"gradients of {', '.join(missing)}: the rendering has no such pass")
         records = np.empty(len(self.lists.records) * RECORD, np.float32)
         active = len(self.features) - len(self.gaussians), self.lists.records, records
-        over_tiles(unblend_range, self.lists, camera, self.given(), self.kept, flags, given, *active)
+        over_tiles(unblend_range, self.lists, camera, self.given(), self.kept, tuple(wanted.values()), given, *active)
         values = values_of(self.gaussians)
         found = tuple(np.zeros(v.shape, np.float32) for v in values)
         how = pack_camera(camera), float(self.settings.low_pass), bool(self.gaussians.antialiased)
@@ -229,20 +228,11 @@ def over_tiles(kernel_range: Callable[..., Any], lists: TileLists, camera: Camer
     parallel_map(lambda part: kernel_range(part, packed, *args), parts)
 
 
-def contributions(gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: Mask) -> Contributions:
-    labels = np.ones((camera.height, camera.width), bool) if pixels is None else pixels != 0
-    total, peak = _weigh(gaussians, camera, settings, labels, 1, None)
-    return Contributions(total[0], peak)
-
-
-def label_weights(gaussians: Gaussians, camera: Camera, labels: np.ndarray, count: int, rows: Mask) -> np.ndarray:
-    return _weigh(gaussians, camera, RasterSettings(), labels, count, rows)[0]
-
-
-def _weigh(
+def weigh(
     gaussians: Gaussians, camera: Camera, settings: RasterSettings, labels: np.ndarray, count: int, rows: Mask
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]."""
+    """Sums of blend weights over the pixels of each label, [count, N], and their maximum over all of them, [N]; those
+    of other `rows` than the given may be too small."""
     shape = (camera.height, camera.width)
     if labels.shape != shape:
         raise ValueError(f"pixels: expected shape {shape}, got {labels.shape}")

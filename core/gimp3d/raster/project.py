@@ -16,7 +16,7 @@ from numba import float32, float64, int32, int64
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.simd import LOG2E, exp64, load1, log2_64, store1
 from .harmonics import BASIS_PLANES, sh_basis
-from .staging import CHUNK, LOGIT, S0, S1, STAGED, X, Z, facing_normal, load3, rotation_of, stage, store3, to_camera
+from .staging import CHUNK, LOGIT, S0, S1, STAGED, X, facing_normal, load3, rotation_of, stage, store3, to_camera
 
 TILE = 32  # px, side of a tile
 
@@ -49,12 +49,10 @@ EXPONENT_BITS = np.int32(0x7F800000)  # a float32 is finite if its magnitude bit
 MAGNITUDE_BITS = np.int32(0x7FFFFFFF)
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
-# Scratch planes after those of what is staged
-OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_WIDTH, OUT_HALF_HEIGHT, OUT_LOG2, OUT_NX = range(
-    STAGED, 20 * CHUNK, CHUNK
-)
-OUT_CENTRE_X, _, _, OUT_UY, _, _, OUT_AX, OUT_AY = range(22 * CHUNK, 30 * CHUNK, CHUNK)  # as in a feature row
-PLANES = 30
+# Scratch planes after those of what is staged: a feature row's slots, then half the bound's width
+OUT_X, OUT_Y, OUT_XX, OUT_XY, OUT_YY, OUT_HALF_HEIGHT, OUT_LOG2, OUT_DEPTH = range(STAGED, 19 * CHUNK, CHUNK)
+OUT_NX, OUT_CENTRE_X, OUT_UY, OUT_AX = (STAGED + slot * CHUNK for slot in (NORMAL_X, CENTRE_X, U_Y, A_X))
+OUT_HALF_WIDTH, PLANES = STAGED + (A_Y + 1) * CHUNK, 11 + A_Y + 2
 
 
 @dataclass(frozen=True)
@@ -155,6 +153,7 @@ def _ellipses(s, n, camera, low_pass, log2_alpha_min, antialiased):
         store1(s, OUT_X + k, fx * tan_x + cx)
         store1(s, OUT_Y + k, fy * tan_y + cy)
         store3(s, OUT_XX, k, whiten_xx, -whiten_xx * uv / yy, math.sqrt(HALF_LOG2E / yy))
+        store1(s, OUT_DEPTH + k, z)
         store1(s, OUT_HALF_WIDTH + k, radius * math.sqrt(xx))
         store1(s, OUT_HALF_HEIGHT + k, radius * math.sqrt(yy))
         store1(s, OUT_LOG2 + k, log2_opacity)
@@ -218,6 +217,7 @@ def _surfels(s, n, camera, low_pass, log2_alpha_min):
         store1(s, OUT_XX + k, math.sqrt(syy / area) if bounded else 1.0 / FAR)
         store1(s, OUT_XY + k, -sxy / math.sqrt(area * syy) if bounded else 0.0)
         store1(s, OUT_YY + k, 1.0 / math.sqrt(syy) if bounded else 1.0 / FAR)
+        store1(s, OUT_DEPTH + k, z)
         store1(s, OUT_HALF_WIDTH + k, math.sqrt(sxx) if bounded else FAR)
         store1(s, OUT_HALF_HEIGHT + k, math.sqrt(syy) if bounded else FAR)
         store1(s, OUT_LOG2 + k, log2_opacity)
@@ -226,7 +226,7 @@ def _surfels(s, n, camera, low_pass, log2_alpha_min):
         store3(s, OUT_CENTRE_X, k, mean_x, mean_y, u_x)
         store3(s, OUT_UY, k, u_y, v_x, v_y)
         store1(s, OUT_AX + k, a_x)
-        store1(s, OUT_AY + k, a_y)
+        store1(s, OUT_AX + CHUNK + k, a_y)
 
 
 @inline_kernel
@@ -330,19 +330,14 @@ def _emit(s, n, rows, sh_bits, tiles, log2_alpha_min, surfels, flat, row_size, r
         states[i] = DRAWN
         rects[i, 0], rects[i, 1], rects[i, 2], rects[i, 3] = x0, y0, x1, y1
         o = i * row_size
-        store1(flat, o + BOUND_X, float32(x))
-        store1(flat, o + BOUND_Y, float32(y))
+        for slot in range(CENTRE_X):  # colours come later, if at all
+            store1(flat, o + slot, float32(load1(s, STAGED + slot * CHUNK + k)))
+        if surfels:
+            for slot in range(CENTRE_X, A_Y + 1):
+                store1(flat, o + slot, float32(load1(s, STAGED + slot * CHUNK + k)))
         store1(flat, o + WHITEN_XX, float32(max(xx, 1.0 / FAR)))
-        store1(flat, o + WHITEN_XY, float32(load1(s, OUT_XY + k)))
         store1(flat, o + WHITEN_YY, float32(max(load1(s, OUT_YY + k), 1.0 / FAR)))
         store1(flat, o + HALF_HEIGHT, float32(min(half_height, FAR)))
-        store1(flat, o + LOG2_OPACITY, float32(log2_opacity))
-        store1(flat, o + DEPTH, float32(load1(s, Z + k)))
-        for j in range(3):
-            store1(flat, o + NORMAL_X + j, float32(load1(s, OUT_NX + j * CHUNK + k)))
-        if surfels:
-            for j in range(8):  # CENTRE_X … A_Y
-                store1(flat, o + CENTRE_X + j, float32(load1(s, OUT_CENTRE_X + j * CHUNK + k)))
 
 
 @exact_kernel

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry import Window as Window
-
 Mask = np.ndarray | None  # bool, of a picture's pixels [H, W] or a scene's rows [N]; None: all
 PASSES = frozenset({"rgb", "alpha", "depth", "expected_depth", "normal"})
 ALL_PASSES = frozenset({"rgb", "alpha", "depth", "normal"})  # what a picture usually needs

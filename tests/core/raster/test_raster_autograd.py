@@ -14,7 +14,6 @@ from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.raster import (
     PASSES,
-    Contributions,
     Gradients,
     PictureGradients,
     RasterSettings,
@@ -184,10 +183,8 @@ class FakeBackend:
     def drawing(self, gaussians: Gaussians, camera: Camera, *_: object) -> FakeDrawing:
         return FakeDrawing(self.picture(gaussians, camera))
 
-    def contributions(
-        self, gaussians: Gaussians, camera: Camera, settings: RasterSettings, pixels: np.ndarray | None
-    ) -> Contributions:
-        return Contributions(np.full(len(gaussians), 9, np.float32), np.full(len(gaussians), 10, np.float32))
+    def weigh(self, gaussians: Gaussians, *_: object) -> tuple[np.ndarray, np.ndarray]:
+        return np.full((1, len(gaussians)), 9, np.float32), np.full(len(gaussians), 10, np.float32)
 
 
 @pytest.fixture
