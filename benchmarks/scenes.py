@@ -176,6 +176,11 @@ def filled(gaussians: Gaussians, result: RemovalResult) -> Gaussians:
     return left.extended(result.added) if result.added else left
 
 
+def new_gaussians(result: RemovalResult) -> Gaussians | None:
+    """What a removal adds and was not there before."""
+    return result.added and result.added.take(np.arange(result.changed, len(result.added)))
+
+
 def scores(scene: Scene, pictures: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Means over test views (by ID) of PSNR, SSIM and FLIP: "psnr mask", "flip unseen" and so on."""
     rows: dict[str, list[float]] = {}

@@ -118,11 +118,8 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
 
 
-def sh_basis(
-    directions: np.ndarray,  # [..., 3] unit, from the camera to the point
-    degree: int,  # 0–3
-) -> np.ndarray:
-    """Y_k(ω) with 3DGS's signs and order, [..., (degree+1)²]."""
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Y_k(ω) [..., (degree+1)²], 3DGS's signs and order, of unit directions [..., 3] from the camera to the point."""
     x, y, z = np.moveaxis(directions, -1, 0)
     bands = [np.full_like(x, SH_C0)]
     if degree > 0:

@@ -163,10 +163,9 @@ def write_removal_report(
 
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
     for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
-        names = (f"before_{k}.png", f"after_{k}.png")
-        for name, gaussians in zip(names, (scene, after)):
-            write_drawn(name, gaussians, view)
-        pair = f"<div class=flip><img src='{names[0]}' alt='before'><img src='{names[1]}' alt='after'></div>"
+        for name, gaussians in (("before", scene), ("after", after)):
+            write_drawn(f"{name}_{k}.png", gaussians, view)
+        pair = f"<div class=flip>{_image(f'before_{k}.png', 'before')}{_image(f'after_{k}.png', 'after')}</div>"
         parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
@@ -221,9 +220,7 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
         (s["name"], f"{s['seconds']:.2f} s", _bar(s["seconds"] / longest), f"{s['confidence']:.0%}", s["reason"])
         for s in stages
     )
-    legend = (
-        f"<span class=dot style='background:rgb{colour}'></span>{words}" for words, colour in RULE_COLOURS.values()
-    )
+    legend = (f"<span class=dot style='background:rgb{rgb}'></span>{words}" for words, rgb in RULE_COLOURS.values())
     numbers = (counts | summary.get("selection", {})).items()
     return PAGE.substitute(
         style=STYLE,
@@ -299,10 +296,9 @@ def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
         figures += _figure(_image(f"chart_{k}.png", "hole"), f"chart:{k}, what photos show; red: the hole")
         figures += _figure(_image(f"charts/{k}.png", "completed"), f"chart:{k}, completed")
     table = _table("..nnn.", rows, ("chart", "kind", "texels", "hole", "photos of a texel", "why"))
-    words = (
-        "The surfaces behind the object, straight on. To paint one: <code>--reference chart:N --reference-image FILE"
-    )
-    return f"<h2>Charts</h2><p>{words}</code>.</p>{table}<div class=grid>{figures}</div>" if rows else ""
+    words = "The surfaces behind the object, straight on. To paint one:"
+    code = "<code>--reference chart:N --reference-image FILE</code>"
+    return f"<h2>Charts</h2><p>{words} {code}.</p>{table}<div class=grid>{figures}</div>" if rows else ""
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:

@@ -76,11 +76,6 @@ class RemovalResult:
     changed: int = 0  # … or otherwise not as they were: removed, and the first of those added
     refined_views: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts; empty: nobody was asked
 
-    @property
-    def new(self) -> Gaussians | None:
-        """What is added and was not there before."""
-        return self.added and self.added.take(np.arange(self.changed, len(self.added)))
-
 
 class Store(Protocol):
     """Where finished stages are kept, so that a stopped run can go on (job.StageStore)."""
