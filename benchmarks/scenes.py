@@ -172,8 +172,7 @@ def redrawn(region: Region, number: int) -> Region:
 
 def filled(gaussians: Gaussians, result: RemovalResult) -> Gaussians:
     """The scene after a removal."""
-    left = gaussians.take(result.keep)
-    return left.extended(result.added) if result.added else left
+    return gaussians.take(result.keep).extended(result.added)
 
 
 def new_gaussians(result: RemovalResult) -> Gaussians | None:

@@ -75,8 +75,10 @@ class Gaussians:
         """The Gaussians at `rows` (indices or a boolean mask), in that order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
-    def extended(self, other: Gaussians) -> Gaussians:
-        """These Gaussians followed by `other` of the same kind; the lower SH degree is padded with zeros."""
+    def extended(self, other: Gaussians | None) -> Gaussians:
+        """These Gaussians followed by others of the same kind, if any; the lower SH degree is padded with zeros."""
+        if other is None:
+            return self
         if self.is_surfels != other.is_surfels:
             raise ValueError("cannot join 3D Gaussians and surfels")
         bands = max(self.sh.shape[1], other.sh.shape[1])

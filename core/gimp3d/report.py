@@ -155,8 +155,8 @@ def write_removal_report(
     folder: Path, scene: Gaussians, views: Sequence[View], variants: Sequence[RemovalResult], summary: dict[str, Any]
 ) -> Path:
     """Write index.html and its pictures into `folder`; returns the page's path."""
-    result, after = variants[0], _filled(scene, variants[0])
-    frame = frame_of(scene, [v.camera for v in views])
+    result, frame = variants[0], frame_of(scene, [v.camera for v in views])
+    after = scene.take(result.keep).extended(result.added)
 
     def write_drawn(name: str, gaussians: Gaussians, view: View) -> None:
         write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
@@ -174,7 +174,7 @@ def write_removal_report(
     if len(variants) > 1:
         view = max(views, key=lambda v: _touched(v, result))
         for k, variant in enumerate(variants, 1):
-            write_drawn(f"variant_{k}.png", _filled(scene, variant), view)
+            write_drawn(f"variant_{k}.png", scene.take(variant.keep).extended(variant.added), view)
             parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
@@ -186,11 +186,6 @@ def write_removal_report(
     page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
-
-
-def _filled(scene: Gaussians, result: RemovalResult) -> Gaussians:
-    kept = scene.take(result.keep)
-    return kept if result.added is None else kept.extended(result.added)
 
 
 def _touched(view: View, result: RemovalResult) -> int:
