@@ -25,7 +25,7 @@ from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.exemplar import EDGE
 
 from .command import kept, parser_of, say, told_in_one_line, write
-from .scenes import BUILT_IN, GIVEN, MADE, MASKS, REAL, Scene, filled, mean_psnrs, read_scenes, removal
+from .scenes import BUILT_IN, GIVEN, MADE, MASKS, REAL, Scene, filled, mean_psnrs, new_gaussians, read_scenes, removal
 from .tables import Row, Section, markdown
 from .timing import Watch, about, machine, replaced
 
@@ -177,7 +177,7 @@ def measured(scene: Scene, picture: str, switches: Sequence[Switch]) -> Row:
     except (BadInput, IllPosed) as error:
         return {"refused": str(error)}
     found = mean_psnrs(scene, filled(scene.gaussians, result), scene.test[1:])
-    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(result.new or ())}
+    return found | {"seconds": wall / 1e3, "cpu_s": cpu / 1e3, "added": len(new_gaussians(result) or ())}
 
 
 def changed(settings: RemovalSettings, switches: Sequence[Switch]) -> RemovalSettings:

@@ -21,7 +21,7 @@ from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, render_byte
 from .ablation import changed
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .plots import COLOURS, FAINT, Line, Panel, draw_panels, figure, name_ends
-from .scenes import MADE, Scene, filled, read_scenes, removal, scores
+from .scenes import MADE, Scene, filled, new_gaussians, read_scenes, removal, scores
 from .tables import Row, Section, markdown, mean, values, where
 from .timing import Watch, about, machine
 
@@ -105,7 +105,7 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
     result = removal(scene, settings, reference, scene.truth(reference), observer=watched)
     spent = seconds_of(watch)
     splats = filled(scene.gaussians, result)
-    added = len(result.new or ())
+    added = len(new_gaussians(result) or ())
     row: Row = {"scene": scene.name, "method": name, "added": added, "share": added / max(1, made["target"].sum())}
     row |= {"stages": {s.name: s.seconds for s in result.stages}}
     row |= spent | {"agreement": agreement(scene, splats, result)}

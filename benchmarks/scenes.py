@@ -172,8 +172,12 @@ def redrawn(region: Region, number: int) -> Region:
 
 def filled(gaussians: Gaussians, result: RemovalResult) -> Gaussians:
     """The scene after a removal."""
-    left = gaussians.take(result.keep)
-    return left.extended(result.added) if result.added else left
+    return gaussians.take(result.keep).extended(result.added)
+
+
+def new_gaussians(result: RemovalResult) -> Gaussians | None:
+    """What a removal adds and was not there before."""
+    return result.added and result.added.take(np.arange(result.changed, len(result.added)))
 
 
 def scores(scene: Scene, pictures: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -22,7 +22,7 @@ from gimp3d.run import unobserved
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
 from .plots import Line, Panel, draw_panels
-from .scenes import Scene, cached_scene, filled, mean_psnrs, read_scenes, removal, side_by_side
+from .scenes import Scene, cached_scene, filled, mean_psnrs, new_gaussians, read_scenes, removal, side_by_side
 from .tables import Row, Section, columns, markdown, values, where
 from .timing import about, machine
 
@@ -96,7 +96,7 @@ def perturbed_views(scene: Scene, reference: Camera, kind: str, level: float) ->
 
 def grown(result: RemovalResult, region: Region) -> Row:
     """What is new: how many, whether all is finite, the largest splat and the farthest, in diagonals of the box."""
-    new, added = result.new, result.added
+    new, added = new_gaussians(result), result.added
     if not new or not added:
         return {"added": 0, "finite": True, "largest": 0.0, "farthest": 0.0}
     corners = np.concatenate([box.corners() for box in region])

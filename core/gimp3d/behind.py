@@ -101,9 +101,9 @@ def look_behind(
         targets = charted.targets
         masks = replace(masks, selection=charted.selection, views=targets.views)
         views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
+    behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
     if not settings.refine.steps:
-        return Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
+        return behind
     given = scene, region, masks.removed, views, charted.charts, settings, run.progress
     learned = run("relearn", relearn, *given)
-    changed = np.union1d(lit.rows, learned.rows)
-    return Behind(scene, learned.scene(scene), changed, masks, views, charted.charts, lit)
+    return replace(behind, scene=learned.scene(scene), changed=np.union1d(lit.rows, learned.rows))

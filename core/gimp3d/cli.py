@@ -13,6 +13,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -47,8 +48,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"gimp3d {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
-    def command(run: Callable[[Namespace, Reporter], None], words: str) -> Callable[..., Any]:
-        added = commands.add_parser(run.__name__.strip("_"), help=words)
+    def command(name: str, run: Callable[[Namespace, Reporter], None], words: str) -> Callable[..., Any]:
+        added = commands.add_parser(name, help=words)
         added.set_defaults(run=run)
         return added.add_argument
 
@@ -58,19 +59,20 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-Command = Callable[[Callable[[Namespace, "Reporter"], None], str], Callable[..., Any]]  # adds one; its add_argument
+# Adds a command by its name, what runs it and words; returns its add_argument.
+Command = Callable[[str, Callable[[Namespace, "Reporter"], None], str], Callable[..., Any]]
 
 
 def _scene_commands(command: Command) -> None:
-    option = command(_info, "say what a scene file holds")
+    option = command("info", _info, "say what a scene file holds")
     option("scene", type=Path)
     option("--json", action="store_true", help="as JSON")
 
-    option = command(_convert, "write a scene as an Inria-style PLY")
+    option = command("convert", partial(_call, "convert"), "write a scene as an Inria-style PLY")
     option("source", metavar="IN", type=Path)
     option("target", metavar="OUT", type=Path)
 
-    option = command(_render, "draw a scene from its cameras")
+    option = command("render", partial(_call, "render_views"), "draw a scene from its cameras")
     _scene_and_cameras(option)
     option("--split", choices=("train", "test", "all"), default="all")
     option("--frames", metavar="ID,ID", type=_names, help="only these cameras")
@@ -79,7 +81,7 @@ def _scene_commands(command: Command) -> None:
     option("--background", type=_three, default="0,0,0", metavar="R,G,B", help="0–1 each")
     _running(option)
 
-    option = command(_masks, "write the region to fill in every view")
+    option = command("masks", partial(_call, "write_masks"), "write the region to fill in every view")
     _scene_and_cameras(option)
     option("--roi", required=True, type=Path)
     _object(option)
@@ -90,7 +92,7 @@ def _scene_commands(command: Command) -> None:
     option("--frames", metavar="ID,ID", type=_names, help="only these cameras are written")
     _running(option)
 
-    option = command(_orbit, "make cameras round a region")
+    option = command("orbit", _orbit, "make cameras round a region")
     option("scene", type=Path)
     option("--roi", required=True, type=Path)
     option("--out", required=True, metavar="CAMS.json", type=Path)
@@ -101,7 +103,7 @@ def _scene_commands(command: Command) -> None:
 
 
 def _remove_command(command: Command) -> None:
-    option = command(_remove, "remove what lies in the region and fill the hole")
+    option = command("remove", _remove, "remove what lies in the region and fill the hole")
     option("scene", nargs="?")
     option("--cameras")
     option("--roi")
@@ -127,14 +129,14 @@ def _remove_command(command: Command) -> None:
 
 
 def _scoring_commands(command: Command) -> None:
-    option = command(_evaluate, "score pictures against true ones")
+    option = command("evaluate", _evaluate, "score pictures against true ones")
     for name in ("--pred", "--truth", "--masks"):
         option(name, required=True, metavar="DIR", type=Path)
     option("--mask-suffix", default=".mask.png")
     option("--exclude", default="", metavar="ID,ID", type=_names)
     option("--json", metavar="FILE", type=Path)
 
-    option = command(_bench, "score removals on scenes with ground truth, beside baselines")
+    option = command("bench", _bench, "score removals on scenes with ground truth, beside baselines")
     option("data", metavar="DATA", type=Path, help="folder of scenes, each with truth/")
     option("--out", required=True, metavar="DIR", type=Path, help="where results and pictures go")
     option("--scenes", default="", metavar="NAME,NAME", type=_names)
@@ -172,10 +174,9 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _three(text: str) -> tuple[float, ...]:
-    try:
+    values: tuple[float, ...] = ()
+    with suppress(ValueError):
         values = tuple(float(v) for v in text.split(","))
-    except ValueError:
-        values = ()
     if len(values) != 3 or not all(abs(v) < float("inf") for v in values):
         raise argparse.ArgumentTypeError(f"3 numbers separated by commas expected, got {text!r}")
     return values
@@ -219,9 +220,8 @@ def _fail(shown: Reporter, code: int, message: str) -> int:
 
 def _logged(arguments: Sequence[str] | None) -> str:
     """Write down the exception that is being handled; says where."""
-    words = (
-        f"gimp3d {__version__}, {sys.version}, {sys.platform}\n{arguments or sys.argv[1:]}\n{traceback.format_exc()}"
-    )
+    program = f"gimp3d {__version__}, {sys.version}, {sys.platform}"
+    words = f"{program}\n{arguments or sys.argv[1:]}\n{traceback.format_exc()}"
     path = user_state_folder() / "logs" / f"{time.strftime('%Y-%m-%d-%H%M%S')}-{os.getpid()}.log"
     try:
         write_atomically(path, lambda f: f.write(words.encode("utf-8", "backslashreplace")))
@@ -278,22 +278,12 @@ def _info(given: Namespace, _: Reporter) -> None:
     say(json.dumps(facts, indent=1) if given.json else "\n".join(lines), sys.stdout)
 
 
-def _convert(given: Namespace, _: Reporter) -> None:
-    from .commands import convert
+def _call(function: str, given: Namespace, shown: Reporter) -> None:
+    """What a command does that is a function of `commands`, and says nothing at its end."""
+    from . import commands
 
-    convert(**_values(given))
-
-
-def _render(given: Namespace, shown: Reporter) -> None:
-    from .commands import render_views
-
-    render_views(**_values(given), progress=shown)
-
-
-def _masks(given: Namespace, shown: Reporter) -> None:
-    from .commands import write_masks
-
-    write_masks(**_values(given), progress=shown)
+    progress = {"progress": shown} if "progress" in given else {}
+    getattr(commands, function)(**_values(given), **progress)
 
 
 def _remove(given: Namespace, shown: Reporter) -> None:
@@ -315,8 +305,8 @@ def _remove(given: Namespace, shown: Reporter) -> None:
         return
     shown.last(stage="done", summary=summary)
     if not given.quiet and given.progress == "bar":
-        seconds = time.perf_counter() - start
         written = ", ".join(v["out"] for v in summary["variants"])
+        seconds = time.perf_counter() - start
         say(f"{count_words(summary['counts'])} in {seconds:.1f} s: {written}", sys.stdout)
         if summary["verdict"]:
             say(f"score {summary['verdict']['score']:.2f}: {'; '.join(summary['verdict']['words'])}", sys.stdout)
@@ -394,10 +384,8 @@ def entry_point() -> None:
         code = main()
     except SystemExit as end:  # --help
         code = int(end.code or 0)
-    except Terminated as end:
-        code = end.exit_code
-    except KeyboardInterrupt:
-        code = Cancelled.exit_code
+    except KeyboardInterrupt as end:
+        code = end.exit_code if isinstance(end, Terminated) else Cancelled.exit_code
     with suppress(OSError, ValueError, AttributeError, KeyboardInterrupt):  # the reader of our output may have gone
         sys.stdout.flush()
         sys.stderr.flush()
@@ -411,7 +399,3 @@ def _open_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
-
-
-if __name__ == "__main__":
-    entry_point()

@@ -401,12 +401,9 @@ def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:
     """A hash of everything that a stage's result depends on."""
     digest = hashlib.sha256(__version__.encode())
-    free = ("out", "views_out", "report", "summary", "threads", "device", "variants")
-    files = ("scene", "cameras", "roi", "reference_image")
-    folders = ("images", "extra_masks", "shadow_masks")
-    settings = {k: v for k, v in asdict(job).items() if k not in (*free, *files, *folders)}
+    settings = {k: v for k, v in asdict(job).items() if k not in (*job.PATHS, "threads", "device", "variants")}
     digest.update(json.dumps(settings, sort_keys=True).encode())
-    for path in (getattr(job, f) for f in files):
+    for path in (job.scene, job.cameras, job.roi, job.reference_image):
         if path and Path(path).is_file():
             digest.update(Path(path).read_bytes())
     for provider in (job.inpaint, job.depth_prior, job.refine_views or ""):

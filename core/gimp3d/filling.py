@@ -54,10 +54,6 @@ class Filling:
     recoloured: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # rows of `kept` that are not as they came
     asked: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts
 
-    @property
-    def filled(self) -> Gaussians:
-        return self.kept if self.added is None else self.kept.extended(self.added)
-
 
 def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequence[Turn]) -> Filling:
     """Complete one reference after the other and carry it into every view, until little is left open."""
@@ -128,7 +124,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
 
 def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
     """A completed reference in every view, and the Gaussians that show it."""
-    settings, views, filled = run.settings, filling.views, filling.filled
+    settings, views, filled = run.settings, filling.views, filling.kept.extended(filling.added)
     seeds = run(f"seed{suffix}", seed_surface, completed, filled.is_surfels, settings, words=counted)
     if len(seeds) == 0:
         name = completed.camera.id

@@ -15,6 +15,7 @@ import numpy as np
 from .box import Box, Region
 from .camera import Camera
 from .gaussians import Gaussians
+from .geometry import framed
 from .stages.charts import Chart
 
 ORDINARY = (0.5, 128.0)  # scene units: usual depths in views at which a scene keeps its units …
@@ -96,7 +97,8 @@ def frame_of(scene: Gaussians, cameras: Sequence[Camera]) -> Frame:
     """
     usable = np.flatnonzero(scene.usable)
     points = scene.means[usable[:: len(usable) // SAMPLED + 1]].astype(np.float64)
-    depths = [_usual_depth(points, c) for c in cameras[:: len(cameras) // VIEWS + 1]]
+    in_view = [framed(c, points)[3] for c in cameras[:: len(cameras) // VIEWS + 1]]
+    depths = [np.median(z) if len(z) else np.nan for z in in_view]
     usual = float(np.nanmedian(depths)) if np.isfinite(depths).any() else np.nan
     if not np.isfinite(usual) or usual <= 0:
         return Frame(np.zeros(3), 1.0)
@@ -106,11 +108,3 @@ def frame_of(scene: Gaussians, cameras: Sequence[Camera]) -> Frame:
         return Frame(np.zeros(3), scale)
     step = 2.0 ** round(np.log2(usual))  # so that single precision loses nothing by the difference
     return Frame(np.round(middle / step) * step, scale)
-
-
-def _usual_depth(points: np.ndarray, camera: Camera) -> float:
-    """The median z of what lies in the picture; NaN if nothing does."""
-    uv, z = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(-1)
-    return float(np.median(z[inside])) if inside.any() else np.nan

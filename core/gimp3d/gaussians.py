@@ -75,8 +75,10 @@ class Gaussians:
         """The Gaussians at `rows` (indices or a boolean mask), in that order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
-    def extended(self, other: Gaussians) -> Gaussians:
-        """These Gaussians followed by `other` of the same kind; the lower SH degree is padded with zeros."""
+    def extended(self, other: Gaussians | None) -> Gaussians:
+        """These Gaussians followed by others of the same kind, if any; the lower SH degree is padded with zeros."""
+        if other is None:
+            return self
         if self.is_surfels != other.is_surfels:
             raise ValueError("cannot join 3D Gaussians and surfels")
         bands = max(self.sh.shape[1], other.sh.shape[1])
@@ -118,11 +120,8 @@ def matrices_to_quats(matrices: np.ndarray) -> np.ndarray:
     return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
 
 
-def sh_basis(
-    directions: np.ndarray,  # [..., 3] unit, from the camera to the point
-    degree: int,  # 0–3
-) -> np.ndarray:
-    """Y_k(ω) with 3DGS's signs and order, [..., (degree+1)²]."""
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Y_k(ω) [..., (degree+1)²], 3DGS's signs and order, of unit directions [..., 3] from the camera to the point."""
     x, y, z = np.moveaxis(directions, -1, 0)
     bands = [np.full_like(x, SH_C0)]
     if degree > 0:

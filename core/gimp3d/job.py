@@ -70,7 +70,7 @@ class RemovalJob:
 
     def resolved(self, folder: Path) -> RemovalJob:
         """The same job with its relative paths made absolute against `folder`."""
-        return self._with_paths(lambda v: str(folder / v))
+        return self._with_paths(lambda value: str(folder / value))
 
     def outs(self) -> list[Path]:
         """The scenes that are written: OUT.ply, OUT.2.ply and so on, one for each variant."""
@@ -99,11 +99,16 @@ def save_job(folder: Path, job: RemovalJob) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"job: cannot make the folder {folder} ({error.strerror})") from None
-    # The mark makes the file's content one that nobody else can have written, see _remember.
+    # The mark makes the file's content one that nobody else can have written, see _record.
     document = {"version": JOB_VERSION, "mark": secrets.token_hex(16), **asdict(job.relative_to(folder))}
     text = json.dumps(document, indent=1).encode()
     write_atomically(folder / "job.json", lambda f: f.write(text))
-    _remember(_record(text))
+    with suppress(OSError):  # where there is no place for the mark, the job counts as a stranger's
+        record = _record(text)
+        record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        record.touch()
+        for stale in sorted(record.parent.iterdir(), key=lambda p: p.stat().st_mtime)[:-MOST_RECORDS]:
+            stale.unlink()
 
 
 def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command: bool = False) -> RemovalJob:
@@ -188,16 +193,6 @@ def _record(text: bytes) -> Path:
     return user_state_folder() / "jobs" / hashlib.sha256(text).hexdigest()
 
 
-def _remember(record: Path) -> None:
-    """Keep the mark; where there is no place for it, the job counts as a stranger's."""
-    with suppress(OSError):
-        record.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        record.touch()
-        oldest = sorted(record.parent.iterdir(), key=lambda p: p.stat().st_mtime)
-        for stale in oldest[:-MOST_RECORDS]:
-            stale.unlink()
-
-
 class StageStore:
     """Keeps each stage's result in `folder` under the key of the whole job's inputs.
 
@@ -206,13 +201,7 @@ class StageStore:
     this user's runs on this machine can make, as kernels trust the shapes of what stages hand on.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        key: str,
-        resume: bool,
-        settings: Mapping[str, Any] | None = None,  # of the whole removal, as plain values
-    ) -> None:
+    def __init__(self, folder: Path, key: str, resume: bool, settings: Mapping[str, Any] | None = None) -> None:
         self.folder, self.key, self.resume = folder, key, resume
         self.settings = json.loads(json.dumps(settings or {}))  # tuples as they come back
         self.secret = user_secret()
@@ -292,16 +281,15 @@ class SharedStages:
         self.own: StageStore | None = None
 
     def load(self, name: str) -> Any | None:
-        if name not in self.results and self.own and (found := self.own.load(name)) is not None:
-            self._keep(name, found)
-            return found
-        return self.results.get(name)
+        found = self.results.get(name)
+        if found is None and self.own:
+            found = self.own.load(name)
+        if found is not None and name in self.names:
+            self.results[name] = found
+        return found
 
     def save(self, name: str, result: Any) -> None:
-        self._keep(name, result)
-        if self.own:
-            self.own.save(name, result)
-
-    def _keep(self, name: str, result: Any) -> None:
         if name in self.names:
             self.results[name] = result
+        if self.own:
+            self.own.save(name, result)

@@ -38,8 +38,7 @@ def free_addresses() -> int | None:
 
 def require_memory(needed: float, what: str, addresses: float | None = None) -> None:
     """Raise MemoryError now if so many bytes of memory and of address space cannot be had."""
-    wanted = ((needed, free_memory()), (needed if addresses is None else addresses, free_addresses()))
-    for size, free in wanted:
+    for size, free in ((needed, free_memory()), (addresses or needed, free_addresses())):
         if free is not None and size > free:
             raise MemoryError(f"{what} takes about {size / 2**20:,.0f} MiB and {free / 2**20:,.0f} MiB are free")
 

@@ -126,8 +126,7 @@ def draw(picture: Picture) -> np.ndarray:
     if picture.kind in ("mask", "chart"):
         return tinted(image, data[0], (230, 60, 60))
     if picture.kind == "shadow":
-        light, lifted = data
-        return np.hstack([image, np.repeat(light[..., None], 3, axis=2), lifted])
+        return np.hstack([image, np.repeat(data[0][..., None], 3, axis=2), data[1]])
     if picture.kind == "refined":
         return np.hstack([data[0], image])
     if picture.kind == "rules":
@@ -142,13 +141,8 @@ def draw(picture: Picture) -> np.ndarray:
     return fit_plot(*data) if picture.kind == "fit" else outlined(image, data[0])
 
 
-def tinted(
-    image: np.ndarray,  # [H, W, 3] uint8
-    mask: np.ndarray,  # [H, W] bool
-    colour: tuple[int, int, int],
-    strength: float = 0.5,
-) -> np.ndarray:
-    """The image with a colour laid over the mask."""
+def tinted(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int], strength: float = 0.5) -> np.ndarray:
+    """The image [H, W, 3] uint8 with a colour laid over the mask [H, W] bool."""
     mixed = (1 - strength) * image + strength * np.array(colour)
     return np.where(mask[..., None], mixed, image).astype(np.uint8)
 
@@ -159,11 +153,8 @@ def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return cv2.drawContours(image.copy(), contours, -1, (230, 60, 60), 1)
 
 
-def relief(
-    depth: np.ndarray,  # [H, W] z, 0 = nothing
-    mask: np.ndarray,  # [H, W] bool, outlined
-) -> np.ndarray:
-    """Depth as colour, shaded like a relief."""
+def relief(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Depth [H, W] (z, 0 = nothing) as colour, shaded like a relief, the mask outlined."""
     disparity, there = disparity_of(depth).astype(np.float64), depth > 0
     low, high = np.percentile(disparity[there], [2, 98]) if there.any() else (0.0, 1.0)
     span = max(high - low, 1e-12)

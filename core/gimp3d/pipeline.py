@@ -168,7 +168,7 @@ def _judge(run: Run, views: Sequence[View], behind: Behind, filling: Filling, by
         "verdict",
         judge,
         behind.before,
-        filling.filled,
+        filling.kept.extended(filling.added),
         behind.masks.views,
         [v.left.target for v in filling.views],
         {v.id: v.bare for v in filling.views},
@@ -214,8 +214,7 @@ def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
     changed &= result.keep  # some were taken away since
     if not changed.any():
         return result
-    anew = behind.scene.take(changed)
-    added = anew if result.added is None else anew.extended(result.added)
+    added = behind.scene.take(changed).extended(result.added)
     return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
 
 

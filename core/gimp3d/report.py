@@ -155,18 +155,17 @@ def write_removal_report(
     folder: Path, scene: Gaussians, views: Sequence[View], variants: Sequence[RemovalResult], summary: dict[str, Any]
 ) -> Path:
     """Write index.html and its pictures into `folder`; returns the page's path."""
-    result, after = variants[0], _filled(scene, variants[0])
-    frame = frame_of(scene, [v.camera for v in views])
+    result, frame = variants[0], frame_of(scene, [v.camera for v in views])
+    after = scene.take(result.keep).extended(result.added)
 
     def write_drawn(name: str, gaussians: Gaussians, view: View) -> None:
         write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
 
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
     for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
-        names = (f"before_{k}.png", f"after_{k}.png")
-        for name, gaussians in zip(names, (scene, after)):
-            write_drawn(name, gaussians, view)
-        pair = f"<div class=flip><img src='{names[0]}' alt='before'><img src='{names[1]}' alt='after'></div>"
+        for name, gaussians in (("before", scene), ("after", after)):
+            write_drawn(f"{name}_{k}.png", gaussians, view)
+        pair = f"<div class=flip>{_image(f'before_{k}.png', 'before')}{_image(f'after_{k}.png', 'after')}</div>"
         parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
     for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
@@ -175,7 +174,7 @@ def write_removal_report(
     if len(variants) > 1:
         view = max(views, key=lambda v: _touched(v, result))
         for k, variant in enumerate(variants, 1):
-            write_drawn(f"variant_{k}.png", _filled(scene, variant), view)
+            write_drawn(f"variant_{k}.png", scene.take(variant.keep).extended(variant.added), view)
             parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
@@ -187,11 +186,6 @@ def write_removal_report(
     page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
-
-
-def _filled(scene: Gaussians, result: RemovalResult) -> Gaussians:
-    kept = scene.take(result.keep)
-    return kept if result.added is None else kept.extended(result.added)
 
 
 def _touched(view: View, result: RemovalResult) -> int:
@@ -221,9 +215,7 @@ def _page(summary: dict[str, Any], parts: dict[str, list[str]], result: RemovalR
         (s["name"], f"{s['seconds']:.2f} s", _bar(s["seconds"] / longest), f"{s['confidence']:.0%}", s["reason"])
         for s in stages
     )
-    legend = (
-        f"<span class=dot style='background:rgb{colour}'></span>{words}" for words, colour in RULE_COLOURS.values()
-    )
+    legend = (f"<span class=dot style='background:rgb{rgb}'></span>{words}" for words, rgb in RULE_COLOURS.values())
     numbers = (counts | summary.get("selection", {})).items()
     return PAGE.substitute(
         style=STYLE,
@@ -299,10 +291,9 @@ def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
         figures += _figure(_image(f"chart_{k}.png", "hole"), f"chart:{k}, what photos show; red: the hole")
         figures += _figure(_image(f"charts/{k}.png", "completed"), f"chart:{k}, completed")
     table = _table("..nnn.", rows, ("chart", "kind", "texels", "hole", "photos of a texel", "why"))
-    words = (
-        "The surfaces behind the object, straight on. To paint one: <code>--reference chart:N --reference-image FILE"
-    )
-    return f"<h2>Charts</h2><p>{words}</code>.</p>{table}<div class=grid>{figures}</div>" if rows else ""
+    words = "The surfaces behind the object, straight on. To paint one:"
+    code = "<code>--reference chart:N --reference-image FILE</code>"
+    return f"<h2>Charts</h2><p>{words} {code}.</p>{table}<div class=grid>{figures}</div>" if rows else ""
 
 
 def _references(choices: Sequence[ReferenceChoice]) -> str:

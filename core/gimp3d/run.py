@@ -76,11 +76,6 @@ class RemovalResult:
     changed: int = 0  # … or otherwise not as they were: removed, and the first of those added
     refined_views: dict[str, Any] = field(default_factory=dict)  # see ViewRefinement.facts; empty: nobody was asked
 
-    @property
-    def new(self) -> Gaussians | None:
-        """What is added and was not there before."""
-        return self.added and self.added.take(np.arange(self.changed, len(self.added)))
-
 
 class Store(Protocol):
     """Where finished stages are kept, so that a stopped run can go on (job.StageStore)."""
@@ -109,23 +104,19 @@ def counted(new: Gaussians) -> tuple[float, str]:
     return 1.0, f"{len(new)} new Gaussians"
 
 
+@dataclass
 class Run:
     """One removal's stages in order; finished ones are taken from the store."""
 
-    def __init__(
-        self,
-        settings: RemovalSettings,
-        progress: Progress = silent,
-        store: Store | None = None,
-        allow_network: bool = False,
-        observer: Observer = unobserved,
-    ) -> None:
-        self.settings, self.progress, self.store = settings, progress, store
-        self.allow_network, self.observer = allow_network, observer
-        self.stages: list[StageReport] = []
-        self.warnings: list[str] = []
-        self.pictures: list[Picture] = []
-        self.references: list[ReferenceChoice] = []
+    settings: RemovalSettings
+    progress: Progress = silent
+    store: Store | None = None
+    allow_network: bool = False
+    observer: Observer = unobserved
+    stages: list[StageReport] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+    references: list[ReferenceChoice] = field(default_factory=list)
 
     def __call__(
         self,

@@ -30,9 +30,7 @@ class Between:
     high: float = math.inf
 
     def __str__(self) -> str:
-        if math.isinf(self.high):
-            return f"{self.low:g} or more"
-        return f"from {self.low:g} to {self.high:g}"
+        return f"{self.low:g} or more" if math.isinf(self.high) else f"from {self.low:g} to {self.high:g}"
 
 
 # Types of settings. A plain number is from 0 to 1,000.

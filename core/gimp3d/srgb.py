@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 
-def linear(
-    picture: np.ndarray,  # [..., 3] uint8
-) -> np.ndarray:
-    """Linear light in [0, 1] of a picture."""
+def linear(picture: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] of a picture [..., 3] uint8."""
     return decoded(np.arange(256) / 255.0)[picture]
 
 
