@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -51,11 +51,6 @@ class DepthCompletion:
     fit: PriorFit  # how the prior was scaled, if there is one
     clamped: int = 0  # pixels whose disparity had to be clamped
 
-    @classmethod
-    def of(cls, disparity: np.ndarray, *rest: Any) -> DepthCompletion:
-        disparity = disparity.astype(np.float32)
-        return cls(disparity, disparity_of(disparity), *rest)
-
 
 def complete_depth(
     disparity: np.ndarray,  # [H, W] float32, 1/z of the view without the object; 0 = infinitely far (sky)
@@ -81,7 +76,8 @@ def complete_depth(
         trusted = known & ~hole & np.isfinite(disparity) & (disparity >= 0)
     scene = np.where(trusted, disparity, 0.0).astype(np.float64)
     if not hole.any():
-        return DepthCompletion.of(scene, 1.0, "nothing to fill", PriorFit())
+        plain = scene.astype(np.float32)
+        return DepthCompletion(plain, disparity_of(plain), 1.0, "nothing to fill", PriorFit())
     ring = trusted & (cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5) <= RING)
     around, fit, guide = ring if ring.any() else trusted, PriorFit(), None
     if prior is not None:
@@ -116,8 +112,8 @@ def complete_depth(
         confidence *= 0.5
     if unknown.sum() > LARGE * hole.sum():
         confidence *= 0.3
-    result = np.where(hole, np.clip(filled, low, high), scene)
-    return DepthCompletion.of(result, confidence, "; ".join(reasons), fit, clamped)
+    result = np.where(hole, np.clip(filled, low, high), scene).astype(np.float32)
+    return DepthCompletion(result, disparity_of(result), confidence, "; ".join(reasons), fit, clamped)
 
 
 def _continued(scene: np.ndarray, ring: np.ndarray, hole: np.ndarray, surface: str) -> tuple[np.ndarray, str]:

@@ -68,9 +68,8 @@ class Light:
         radius = math.radians(self.softness) * np.sqrt(-2 * np.log(1 - (k + 0.5) / count))
         angle = k * math.pi * (3 - math.sqrt(5))
         a, b = _across(self.towards)
-        rays = self.towards + np.tan(np.minimum(radius, 1.3))[:, None] * (
-            np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b
-        )
+        across = np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b
+        rays = self.towards + np.tan(np.minimum(radius, 1.3))[:, None] * across
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
@@ -78,9 +77,7 @@ def taken_from(
     occluder: Occluder, lights: Sequence[Light], points: np.ndarray, normal: np.ndarray | None = None
 ) -> np.ndarray:
     """[N, 3] the share of light, per channel, that does not arrive at points of a surface."""
-    taken = np.zeros((len(points), 3))
-    for light in lights:
-        taken += _cast(occluder, points, normal, light)[:, None] * light.strength
+    taken = sum(_cast(occluder, points, normal, light)[:, None] * light.strength for light in lights)
     return np.minimum(taken, 1 - DARK)
 
 
@@ -114,19 +111,6 @@ class Receiver(LitSurface):
             for v in (self.colours, self.places)
         )
         return replace(self, shown=count[..., 0] >= 2, colours=colours, places=places)
-
-
-@dataclass(frozen=True)
-class Told:
-    """What speaks for a light."""
-
-    over_chance: float  # what it explains over what chance does
-    share: float  # of what is uneven where its shadow falls that it explains, texture left out
-
-    @property
-    def enough(self) -> float:
-        """1 or more if it is a light."""
-        return min(self.over_chance / EARNS, self.share / FITS)
 
 
 @dataclass(frozen=True)
@@ -164,8 +148,10 @@ class Scenery:
                 step, rounds = step / 2, 0
         return lights
 
-    def told(self, lights: Sequence[Light], bright: Sequence[np.ndarray]) -> list[Told]:
-        """Of each light beside the others; `bright`: changes that shapes make, first the object's where it stands.
+    def told(self, lights: Sequence[Light], bright: Sequence[np.ndarray]) -> np.ndarray:
+        """[L, 2] what speaks for each light beside the others: what it explains over what chance does, and what share
+        of what is uneven where its shadow falls, texture left out. `bright`: changes that shapes make, first the
+        object's where it stands.
 
         Chance explains brightness by any of them, or what these lights leave by yet another shadow of the object.
         """
@@ -184,12 +170,12 @@ class Scenery:
             before, after, usual = there.loss(without), there.loss(left), there.usual_loss
             share = float(np.clip((before - after) / max(before - usual, 1e-12), 0, 1))
             # lights that take more than all light are none
-            found.append(Told(gain / max(chance, 1e-12), share / max(1.0, float(strength.sum()))))
-        return found
+            found.append((gain / max(chance, 1e-12), share / max(1.0, float(strength.sum()))))
+        return np.array(found)
 
 
-def search(scenery: Scenery) -> tuple[list[Light], Told]:
-    """The lights, and what speaks for the weakest; or for the best candidate, if there is none."""
+def search(scenery: Scenery) -> tuple[list[Light], np.ndarray]:
+    """The lights, and what speaks for the weakest, see told; or for the best candidate, if there is none."""
     lit, (rays, shares, lobes) = scenery.lit, _candidates()
 
     def cast(by: Occluder) -> np.ndarray:
@@ -209,7 +195,7 @@ def search(scenery: Scenery) -> tuple[list[Light], Told]:
     lights, settled = [lobes[k] for k in found], False
     while True:
         told = scenery.told(lights, bright)
-        scores = [t.enough if settled else t.over_chance for t in told]
+        scores = (told / [EARNS, FITS]).min(1) if settled else told[:, 0]
         worst = int(np.argmin(scores))
         if scores[worst] >= 1:
             if settled:
@@ -261,11 +247,12 @@ def _cast(occluder: Occluder, points: np.ndarray, normal: np.ndarray | None, lig
         rays = light.rays()
         rays = rays[rays[:, 2] > 0]
         facing = np.ones(len(rays)) if normal is None else _faces(occluder.plane, normal, rays)
-        return occluder.blocked(points, rays) @ (facing / len(rays)).astype(np.float32)
-    rays = _open_sky(occluder.walls)
-    up = rays[:, 2] if normal is None else rays @ (occluder.plane.axes @ normal)
-    facing = np.maximum(up, 0)
-    return occluder.blocked(points, rays) @ (facing / max(float(facing.sum()), 1e-6)).astype(np.float32)
+        total: float = len(rays)
+    else:
+        rays = _open_sky(occluder.walls)
+        facing = np.maximum(rays[:, 2] if normal is None else rays @ (occluder.plane.axes @ normal), 0)
+        total = max(float(facing.sum()), 1e-6)
+    return occluder.blocked(points, rays) @ (facing / total).astype(np.float32)
 
 
 def _open_sky(walls: np.ndarray) -> np.ndarray:

@@ -93,45 +93,42 @@ def _sampled(
     return tuple(colours_at(p.astype(np.float32), at) for p in (photo, *mirror_image(gaussians, plane, camera)))
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """How well a mirror image explains differences between photos of the same places."""
+def _fitted(
+    seen: np.ndarray, photo: np.ndarray, alpha: np.ndarray, light: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """How a mirror image explains differences between photos: strengths [2, 3] of `image` and `elsewhere`, see
+    Reflection; by how much it lowers the squared differences, in units of noise; and what share of them, where it is
+    and noise left out.
 
-    image: np.ndarray  # [3], see Reflection
-    elsewhere: np.ndarray  # [3]
-    gain: float  # by how much it lowers the squared differences, in units of noise
-    share: float  # of what differs where it is that it explains, noise left out
-
-    @classmethod
-    def of(cls, seen: np.ndarray, photo: np.ndarray, alpha: np.ndarray, light: np.ndarray) -> _Fit:
-        """Of V views of T texels: where they see them [V, T] bool, and linear light: photos [V, T, 3], the mirror
-        image's alpha [V, T] and its light times alpha [V, T, 3]."""
-        found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
-        there = seen & (alpha > MIRRORED)
-        if not seen.any():  # few views, or none of one place
-            return cls(found[0], found[1], 0.0, 0.0)
-        for channel in range(3):
-            weight = seen.astype(np.float64)
-            for _ in range(ROUNDS):
-                shown, bright, dark = (
-                    v - (weight * v).sum(0) / np.maximum(weight.sum(0), 1e-9)
-                    for v in (photo[..., channel], light[..., channel], -alpha)
-                )
-                bends = np.array([[(weight * a * b).sum() for b in (bright, dark)] for a in (bright, dark)])
-                slopes = np.array([(weight * a * shown).sum() for a in (bright, dark)])
-                # of a plain object both are alike: the smaller strengths, then
-                root = np.linalg.cholesky(bends + (1e-3 * np.trace(bends) + 1e-12) * np.eye(2))
-                strength = nnls(root.T, np.linalg.solve(root, slopes))[0]
-                left = shown - strength[0] * bright - strength[1] * dark
-                noise = max(1.4826 * float(np.median(np.abs(left[seen]))), LEAST_NOISE)
-                weight = seen / np.sqrt(1 + (left / noise) ** 2)
-            found[:, channel] = strength
-            squares = weight * np.stack([shown, left]) ** 2 / noise**2
-            gain += float(squares[0].sum() - squares[1].sum())
-            explained += float((squares[0] - squares[1])[there].sum())
-            # where photos hardly differ there is nothing to explain
-            uneven += max(float((squares[0] - weight)[there].sum()), float(weight[there].sum()))
-        return cls(found[0], found[1], gain, float(np.clip(explained / uneven, 0, 1)) if uneven > 0 else 0.0)
+    V views show T texels where `seen` [V, T] bool, linear light: photos [V, T, 3], the mirror image's alpha [V, T] and
+    its light times alpha [V, T, 3].
+    """
+    found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
+    there = seen & (alpha > MIRRORED)
+    if not seen.any():  # few views, or none of one place
+        return found, 0.0, 0.0
+    for channel in range(3):
+        weight = seen.astype(np.float64)
+        for _ in range(ROUNDS):
+            shown, bright, dark = (
+                v - (weight * v).sum(0) / np.maximum(weight.sum(0), 1e-9)
+                for v in (photo[..., channel], light[..., channel], -alpha)
+            )
+            bends = np.array([[(weight * a * b).sum() for b in (bright, dark)] for a in (bright, dark)])
+            slopes = np.array([(weight * a * shown).sum() for a in (bright, dark)])
+            # of a plain object both are alike: the smaller strengths, then
+            root = np.linalg.cholesky(bends + (1e-3 * np.trace(bends) + 1e-12) * np.eye(2))
+            strength = nnls(root.T, np.linalg.solve(root, slopes))[0]
+            left = shown - strength[0] * bright - strength[1] * dark
+            noise = max(1.4826 * float(np.median(np.abs(left[seen]))), LEAST_NOISE)
+            weight = seen / np.sqrt(1 + (left / noise) ** 2)
+        found[:, channel] = strength
+        squares = weight * np.stack([shown, left]) ** 2 / noise**2
+        gain += float(squares[0].sum() - squares[1].sum())
+        explained += float((squares[0] - squares[1])[there].sum())
+        # where photos hardly differ there is nothing to explain
+        uneven += max(float((squares[0] - weight)[there].sum()), float(weight[there].sum()))
+    return found, gain, float(np.clip(explained / uneven, 0, 1)) if uneven > 0 else 0.0
 
 
 def find_reflection(
@@ -143,11 +140,10 @@ def find_reflection(
     Whatever does not change with the view – texture, shadow – drops out of differences between photos of a place. A
     reflection must explain most of them where the mirror image is, and clearly more than that of the object elsewhere.
     """
-    mine = [ground for ground in grounds if ground.plane is plane]
-    object_ = standing(gone, plane, extent(region))
-    if not mine or not len(object_):
+    grounds, object_ = sorted(grounds, key=lambda g: g.plane is not plane), standing(gone, plane, extent(region))
+    if not grounds or grounds[0].plane is not plane or not len(object_):
         return "no reflection found: photos do not show the surface that the object stands on"
-    ground, others = mine[0], [g for g in grounds if g.plane is not plane]
+    ground = grounds[0]
     count = min(MOST_VIEWS, len(witnesses))
     used = [witnesses[k * len(witnesses) // count] for k in range(count)]
     known = np.zeros_like(ground.known)
@@ -157,20 +153,19 @@ def find_reflection(
     seen = ask(used, points, ROUGH) == Says.SEEN
     several = seen.sum(0) >= SEVERAL
 
-    def fit(gaussians: Gaussians) -> _Fit:
+    def fit(gaussians: Gaussians) -> tuple[np.ndarray, float, float]:
         parts = parallel_map(lambda w: _sampled(points, w, texel, gaussians, plane), used)
-        return _Fit.of(seen[:, several], *(np.array([p[k] for p in parts])[:, several] for k in range(3)))
+        return _fitted(seen[:, several], *(np.array([p[k] for p in parts])[:, several] for k in range(3)))
 
-    own = fit(object_)
-    words = f"the mirror image explains {own.share:.0%} of how photos differ where it is"
-    if own.share < FITS:
+    strength, gain, share = fit(object_)
+    words = f"the mirror image explains {share:.0%} of how photos differ where it is"
+    if share < FITS:
         return f"no reflection found: {words}"
     width = np.ptp(plane.local(object_.means.astype(np.float64))[:, :2], axis=0).max()
     moves = [x * plane.right + y * plane.down for x, y in places_elsewhere(float(width))]
-    chance = max(fit(replace(object_, means=(object_.means + m).astype(np.float32))).gain for m in moves)
-    over = own.gain / max(chance, 1e-9)
+    chance = max(fit(replace(object_, means=(object_.means + m).astype(np.float32)))[1] for m in moves)
+    over = gain / max(chance, 1e-9)
     words += f", {over:.1f} times what it does elsewhere"
     if over < EARNS:
         return f"no reflection found: {words}"
-    confidence = own.share * (1 - 1 / over)
-    return Reflection((ground, *others), object_, own.image, own.elsewhere, own.share, confidence, words)
+    return Reflection(tuple(grounds), object_, strength[0], strength[1], share, share * (1 - 1 / over), words)

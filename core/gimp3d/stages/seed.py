@@ -195,11 +195,10 @@ def _sum(table: np.ndarray, rectangles: np.ndarray) -> np.ndarray:
 
 
 def settle_gaussians(
-    scene: Gaussians,  # without the new ones
+    scene: Gaussians,
     seeds: Gaussians,
     reference: Camera,
-    views: Sequence[Camera],
-    painted: Sequence[PaintedView],
+    looks: Sequence[Look],
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
     """The seeds that show somewhere, of the scene's SH degree, in colours by which it, drawn, shows the painted views.
@@ -213,13 +212,13 @@ def settle_gaussians(
     """
     degree, sh = min(settings.sh_degree, scene.sh_degree), seeds.sh
     if degree > 0 and not settings.corrections:
-        sh = _fitted_at_centres(seeds, reference, list(zip(views, painted)), degree, settings.harmonics)
+        sh = _fitted_at_centres(seeds, reference, looks, degree, settings.harmonics)
     sh = pad_sh(sh, (scene.sh_degree + 1) ** 2).copy()
     sh[:, 0] += (0.5 - settings.grey) / SH_C0
     new = replace(seeds, sh=sh)
     if not settings.corrections:
         return new
-    others = [(view, paint) for view, paint in zip(views, painted) if paint.rules.any() and view.id != reference.id]
+    others = [(view, paint) for view, paint in looks if paint.rules.any() and view.id != reference.id]
     looks = others[:: math.ceil(len(others) / LOOKS) or 1]
     joined = scene.extended(new)
 
@@ -297,12 +296,12 @@ def _colour_change(
 
 
 def missing_colours(
-    region: PixelRegion,  # of the rest of the scene
-    new: Gaussians,
-    wanted: np.ndarray,  # [H, W] bool
-    picture: np.ndarray,  # [H, W, 3] uint8, what the view should show there
+    region: PixelRegion, new: Gaussians, wanted: np.ndarray, picture: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """W's column sums, and Wᵀ (picture − drawn) in units of c_0, [N, 3] each: W blends the new Gaussians' colours."""
+    """W's column sums, and Wᵀ (picture − drawn) in units of c_0, [N, 3] each: W blends the new Gaussians' colours.
+
+    The region is of the rest of the scene; the picture [H, W, 3] uint8 is what should show where `wanted` [H, W] bool.
+    """
     drawn, way_back = region.trace(new)
     missing = np.where(wanted[..., None], picture / 255.0 - drawn.rgb, 0.0)
     one = np.broadcast_to(wanted[..., None], missing.shape)

@@ -114,11 +114,11 @@ def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], regi
     if not receivers:
         return "no shadow found: photos do not show the surface round the object"
     scenery = Scenery(occluder, receivers)
-    lights, told = search(scenery)
+    lights, (over_chance, share) = search(scenery)
     if not lights:
         return (
-            f"no shadow found: the best light explains {told.over_chance:.1f} times what chance does, "
-            f"{told.share:.0%} of what is uneven where its shadow would fall"
+            f"no shadow found: the best light explains {over_chance:.1f} times what chance does, "
+            f"{share:.0%} of what is uneven where its shadow would fall"
         )
     sky = Light(np.array([0.0, 0.0, 1.0]), math.inf, np.ones(3))
     lights = [*scenery.settled(lights, [sky], FINEST), sky]
@@ -142,10 +142,10 @@ def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], regi
 
     def taken(ground: Ground) -> np.ndarray:
         points = ground.points(FINER)
-        share = taken_from(occluder, lights, points.reshape(-1, 3), ground.plane.normal)
-        return share.reshape(points.shape).astype(np.float32)
+        whole = taken_from(occluder, lights, points.reshape(-1, 3), ground.plane.normal)
+        return whole.reshape(points.shape).astype(np.float32)
 
-    confidence = told.share * (1 - 1 / told.over_chance)
+    confidence = float(share * (1 - 1 / over_chance))
     return Shadow(tuple(grounds), occluder, tuple(lights), tuple(map(taken, grounds)), explained, confidence, words)
 
 

@@ -130,10 +130,13 @@ def judge(
         photo = photos[view.camera.id].astype(np.float32)
         away = cv2.distanceTransform((~view.silhouette).astype(np.uint8), cv2.DIST_L2, 5)
         near, around = away <= RING, away > EDGE
+        ring = near & around
         # as many pixels as the object has
         beside = around & (away <= np.sort(away[around])[: view.silhouette.sum()].max(initial=0))
-        before = _drawn(scene, view.camera, (near & around) | beside)
+        before, after = _drawn(scene, view.camera, ring | beside), _drawn(final, view.camera, near)
+        error = _mean(_squared(before, photo)[beside])
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
+        depth, haze = weights.surface_depth()[0], weights.footprint(floats)
         chart, off = np.zeros((2, *near.shape), np.float32)
         met = (hits or {}).get(view.camera.id)
         if met is not None:
@@ -141,18 +144,7 @@ def judge(
             for number, height in enumerate(unsure):
                 on = (met.depth > 0) & (met.chart == number)
                 off[on] = height[met.rows[on], met.cols[on]]
-        return _Look(
-            view,
-            photo,
-            near & around,
-            before,
-            _drawn(final, view.camera, near),
-            weights.surface_depth()[0],
-            chart,
-            off,
-            weights.footprint(floats),
-            _mean(_squared(before, photo)[beside]),
-        )
+        return _Look(view, photo, ring, before, after, depth, chart, off, haze, error)
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
     total = sum(int(look.view.silhouette.sum()) for look in looks)

@@ -103,10 +103,13 @@ def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> Refi
         pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
         if pasted.warnings:
             raise BadInput(pasted.warnings[0])
-        drift = _drift(painted, pasted.image, mask)
+        inside = mask.astype(np.float32)[..., None]  # under a blur that looks at the mask alone
+        weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), COARSE), 1e-6)[..., None]
+        off = cv2.GaussianBlur((pasted.image.astype(np.float32) - painted) * inside, (0, 0), COARSE) / weight
+        drift = float(np.abs(off)[mask].mean())
         if drift > MOST_DRIFT:
-            off = f"{drift:.0f} grey levels from what was propagated, under a blur"
-            raise BadInput(f"{who.who} painted something else: {off}")
+            words = f"{drift:.0f} grey levels from what was propagated, under a blur"
+            raise BadInput(f"{who.who} painted something else: {words}")
     except BadInput as error:
         return RefinedView(view.camera_id, None, str(error))
     whole = view.image.copy()
@@ -128,11 +131,3 @@ def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> t
 
 def _mask(view: ViewToRefine) -> np.ndarray:
     return ~np.isin(view.rules, KEPT)
-
-
-def _drift(painted: np.ndarray, answer: np.ndarray, mask: np.ndarray) -> float:
-    """Mean difference inside the mask, under a blur that looks at the mask alone."""
-    inside = mask.astype(np.float32)
-    weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), COARSE), 1e-6)[..., None]
-    off = (answer.astype(np.float32) - painted) * inside[..., None]
-    return float(np.abs(cv2.GaussianBlur(off, (0, 0), COARSE) / weight)[mask].mean())

@@ -264,8 +264,8 @@ def settle_seeds(
     settings: RemovalSettings,
 ) -> Gaussians:
     """The seeds that are needed, in the colours of the painted views."""
-    cameras = [v.camera for v in views]
-    return settle_gaussians(filled, seeds, completed.camera, cameras, painting.views, settings.seed)
+    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
+    return settle_gaussians(filled, seeds, completed.camera, looks, settings.seed)
 
 
 def after_reference(

@@ -174,7 +174,7 @@ def test_one_view_gives_sh_degree_zero() -> None:
     image = render_bytes(truth(), camera)
     target = drawn.median_depth > 0
     seeds = seed_gaussians(camera, image, drawn.median_depth, target, False, SeedSettings(largest=1))
-    coloured = settle_gaussians(_of_degree(2), seeds, camera, [], [], SeedSettings(corrections=0))
+    coloured = settle_gaussians(_of_degree(2), seeds, camera, [], SeedSettings(corrections=0))
     assert coloured.sh.shape[1] == 9 and (coloured.sh[:, 1:] == 0).all()
     rows, cols = np.nonzero(target)
     assert len(rows) == len(seeds)
@@ -206,7 +206,7 @@ def test_without_corrections_view_dependence_is_fitted_to_painted_pixels_alone()
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
     chosen = SeedSettings(corrections=0, harmonics=HarmonicsSettings(ridge=0.01))
-    coloured = settle_gaussians(_of_degree(3), seeds, reference, everywhere, painted, chosen)
+    coloured = settle_gaussians(_of_degree(3), seeds, reference, list(zip(everywhere, painted)), chosen)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9
 
@@ -220,7 +220,7 @@ def test_without_corrections_view_dependence_is_fitted_to_painted_pixels_alone()
         change = shown(towards)[:, 0] - shown(to_reference)[:, 0]
         expected = brightness(towards) - brightness(to_reference)
         assert np.median(np.abs(change - expected)) < 0.03
-    later = settle_gaussians(_of_degree(3), seeds, reference, [], [])  # corrections find it, if there are views
+    later = settle_gaussians(_of_degree(3), seeds, reference, [], SeedSettings())  # no view tells more
     assert later.sh.shape[1] == 16 and (later.sh[:, 1:] == 0).all()
 
 
@@ -237,10 +237,14 @@ def _hole_and_truth(count: int = 9) -> tuple[list[ViewToPaint], list[PaintedView
     return views, painted
 
 
+def _looks(views: list[ViewToPaint], painted: list[PaintedView]) -> list[tuple[Camera, PaintedView]]:
+    return [(v.camera, paint) for v, paint in zip(views, painted)]
+
+
 def _filled(views: list[ViewToPaint], painted: list[PaintedView], chosen: SeedSettings) -> Gaussians:
     known, view = floor(with_hole=True), views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False, chosen)
-    return settle_gaussians(known, seeds, view.camera, [v.camera for v in views], painted, chosen)
+    return settle_gaussians(known, seeds, view.camera, _looks(views, painted), chosen)
 
 
 def test_settled_colours_leave_no_seam_and_show_every_view_better_than_pixel_colours() -> None:
@@ -285,8 +289,8 @@ def test_what_each_view_misses_tells_view_dependence_and_what_all_miss_does_not(
         return float(np.mean([(d - p.image)[v.target].mean() ** 2 for d, p, v in zip(drawn, wanted, views)]) ** 0.5)
 
     def settled(degree: int, wanted: list[PaintedView]) -> Gaussians:
-        seen_by = [v.camera for v in views]
-        return settle_gaussians(known, seeds, views[1].camera, seen_by, wanted, SeedSettings(sh_degree=degree))
+        chosen = SeedSettings(sh_degree=degree)
+        return settle_gaussians(known, seeds, views[1].camera, _looks(views, wanted), chosen)
 
     sloped = [_tinted(p, v.camera, 30, 0) for p, v in zip(painted, views)]
     constant, dependent = settled(0, sloped), settled(2, sloped)
@@ -329,7 +333,7 @@ def test_the_papers_constant_lacks_what_3dgs_adds() -> None:
     depth = render(truth(), camera).median_depth
     seeds = seed_gaussians(camera, render_bytes(truth(), camera), depth, depth > 0, False)
     chosen = [SeedSettings(grey=g, corrections=0, sh_degree=0) for g in (0.5, 0.0)]
-    ours, papers = (settle_gaussians(_of_degree(2), seeds, camera, [], [], c) for c in chosen)
+    ours, papers = (settle_gaussians(_of_degree(2), seeds, camera, [], c) for c in chosen)
     np.testing.assert_allclose(papers.sh[:, 0] - ours.sh[:, 0], 0.5 / SH_C0, rtol=1e-5)
     np.testing.assert_allclose(ours.sh[:, 0], seeds.sh[:, 0], atol=1e-6)  # float32, there and back
 
@@ -339,10 +343,10 @@ def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
     view = views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
     below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
-    seen_from = [v.camera for v in views]
-    new = settle_gaussians(truth(), below, view.camera, seen_from, painted)
+    looks = _looks(views, painted)
+    new = settle_gaussians(truth(), below, view.camera, looks, SeedSettings())
     assert len(new) < 0.1 * len(below)  # the floor hides them
-    everything = settle_gaussians(truth(), below, view.camera, seen_from, painted, SeedSettings(corrections=0))
+    everything = settle_gaussians(truth(), below, view.camera, looks, SeedSettings(corrections=0))
     assert np.array_equal(everything.means, below.means)
 
 
