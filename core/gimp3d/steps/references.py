@@ -324,7 +324,7 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     in front, where a splat's soft edge has the depth of neither.
     """
     new = np.zeros(len(filled), bool)
-    new[-added:] = True
+    new[len(filled) - added :] = True
     around = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
     scene = drawing(filled, view.camera, with_colour=False, pixels=touched | dilated(view.target, MARGIN))
     before, uncoloured = (view.depth_after, view.alpha_after), rules == Rule.UNREACHED

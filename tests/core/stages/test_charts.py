@@ -328,6 +328,17 @@ def test_what_photos_disagree_on_below_the_mask_stays_hole(
     assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
 
 
+def test_a_plain_colour_below_the_mask_stays_hole(
+    floor_room: Room, wide: list[Witness], wide_chart: Chart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An object of one colour looks alike in all photos, wherever they meet, and if it is the floor's none tells."""
+    grey = [np.where(w.hidden[..., None], np.uint8(120), w.photo) for w in wide]
+    monkeypatch.setattr(stage, "shows_object", lambda picture, *_: np.zeros(picture.shape[:2], bool))
+    plain = [replace(w, photo=photo) for w, photo in zip(wide, grey)]
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, plain)
+    assert chart.hole[wide_chart.below].all()
+
+
 def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
     floor_room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:

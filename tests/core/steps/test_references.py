@@ -231,6 +231,13 @@ def test_covered_pixels_that_got_no_colour_stay_open() -> None:
     np.testing.assert_array_equal(after.target, square)
 
 
+def test_where_no_seed_stays_the_hole_stays_open() -> None:
+    """What the scene itself draws there is nothing new."""
+    after = still_open(view(), floor(with_hole=False), 0, told(), np.ones_like(view().target))
+    inside = cv2.erode(hole_of(view()).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert inside.sum() > 50 and after.target[inside & view().target].all()
+
+
 def test_nothing_new_leaves_the_hole_as_it_was() -> None:
     far = patch()
     far = replace(far, means=far.means + np.float32([0, 0, -50]))  # below the floor, seen through the hole

@@ -110,7 +110,7 @@ class _Shown:
     known: np.ndarray  # bool
     alike: np.ndarray  # bool, known without allowing for misplaced texture
     hole: np.ndarray  # bool
-    alike_below: np.ndarray  # bool, they differ no more below the masks than elsewhere on the surface
+    alike_below: np.ndarray  # bool, below the masks they have a texture in common, and differ no more than elsewhere
 
 
 def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
@@ -173,11 +173,13 @@ def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], toler
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & (hiding > photos)
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
-    below, spread_below, _ = mosaic(points, plane.normal, witnesses, beneath)
+    below, spread_below, loud_below = mosaic(points, plane.normal, witnesses, beneath)
+    # what has one colour looks alike wherever photos meet: they agree where they share more than they differ by
+    alike_below = (spread_below <= limit) & (spread_below < loud_below)
     several = there & (photos > 1) & ~hole
     known = several & (spread <= limit + MISPLACED * loud)
     image = np.where(hole[..., None], below, image)
-    return _Shown(there, image, photos, hiding, known, several & alike, hole, spread_below <= limit)
+    return _Shown(there, image, photos, hiding, known, several & alike, hole, alike_below)
 
 
 def _told_by_colours(
