@@ -223,6 +223,18 @@ def test_what_the_reference_does_not_see_is_said_to_be_unreached(reference: Refe
     assert run(reference, [shifted]).confidence == 0.0
 
 
+def test_what_the_reference_has_no_colour_of_is_not_painted(reference: Reference) -> None:
+    """A chart goes on where no photo shows it and no view asked for it: black, at the surface's depth."""
+    completed = reference.target & (np.arange(reference.target.shape[1]) < (HOLE[2] + HOLE[3]) // 2)
+    left = reference.target & ~completed
+    half = replace(reference, image=np.where(left[..., None], np.uint8(0), reference.image), target=completed)
+    target = view(reference, 2)
+    _, image, rules = paint(half, target)
+    painted = target.target & (rules == Rule.OWN_PIXELS)
+    assert 0.3 < painted.sum() / target.target.sum() < 0.7
+    assert error(image, target, painted) < 7
+
+
 def test_a_view_without_a_hole_is_left_alone(reference: Reference) -> None:
     target = view(reference, 2)
     nothing = replace(target, target=np.zeros_like(target.target), silhouette=np.zeros_like(target.target))

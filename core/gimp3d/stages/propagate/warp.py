@@ -117,7 +117,10 @@ class Picture(NamedTuple):
 
 def picture_of(view: ViewToPaint | Reference) -> Picture:
     """The view with the object, or the completed reference."""
-    depth, usable = (view.depth, view.source) if isinstance(view, Reference) else (view.depth_before, ~view.silhouette)
+    if isinstance(view, Reference):  # of what is neither completed nor a photo's it has no colour
+        depth, usable = np.where(view.target | view.source, view.depth, 0), view.source
+    else:
+        depth, usable = view.depth_before, ~view.silhouette
     arrays = np.asarray(depth, np.float32), view.image, usable
     return Picture(pack_camera(view.camera), *(np.ascontiguousarray(a) for a in arrays))
 
