@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from . import __version__
-from .behind import BEFORE_FILL
 from .box import read_region
 from .camera import Camera, output_name
 from .compute.jit import announce_compilation
@@ -29,8 +28,8 @@ from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .job import MOST_VARIANTS, RemovalJob, SharedStages, StageStore
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
-from .pictures import draw, of_light
-from .pipeline import RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
+from .pictures import of_light
+from .pipeline import BEFORE_FILL, RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
 from .presets import job_settings, shadow_of
 from .progress import Progress, silent
 from .raster import RasterSettings, render
@@ -224,7 +223,7 @@ def write_masks(
         write_png(out / f"{name}.png", target)
         if pictures and view:
             for looked in (*preview(view, run.settings), *of_light(behind.lit, list(seen), [camera.id])):
-                write_png(pictures / f"{name}.{looked.kind}.png", draw(looked))
+                write_png(pictures / f"{name}.{looked.kind}.png", looked.draw())
 
 
 def write_orbit(

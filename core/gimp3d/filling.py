@@ -117,7 +117,7 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     name = f"appearance{suffix}"
     appearance = run(name, paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
+    run.pictures += pictures.of_depth(completion, depth, view.left.target, view.id)
     source = ~view.left.target & ~view.left.silhouette & (depth > 0)
     return Completed(view.camera, appearance.image, depth, view.left.target, source, charts if rough else ())
 

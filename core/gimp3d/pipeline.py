@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from . import pictures
-from .behind import Behind, look_behind
 from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
@@ -22,9 +21,22 @@ from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
 from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
+from .stages.charts import Chart
+from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks, find_masks
 from .stages.verdict import Verdict, judge
-from .steps.behind import NOT_LIT, Relit
+from .steps.behind import (
+    NOT_LIT,
+    Charted,
+    Found,
+    Relit,
+    chart_surfaces,
+    find_light,
+    find_surfaces,
+    relearn,
+    undo_light,
+    with_contact,
+)
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
 from .view_state import ViewState, open_pixels
 
@@ -33,6 +45,29 @@ __all__ = [
     "provider_notices", "remove_object", "render_bytes",
 ]  # fmt: skip
 REFINERS = ("command", "http", "https")  # who may be asked to refine views
+LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
+# stages that know nothing of fills
+BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "surfaces 2", "charts 3", "relearn")
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What is behind the object, and the scene in the light that it would have without it."""
+
+    before: Gaussians  # the scene with the object, in that light
+    scene: Gaussians  # the same, but what stays round the object is learned anew
+    changed: np.ndarray  # [M] rows of it that are not as they came
+    masks: Masks  # with what had to be cleared away; if there are charts, T is what no photo shows of them
+    views: tuple[ViewState, ...]
+    charts: tuple[Chart, ...]
+    lit: Relit
+
+    def recoloured(self, kept: Gaussians, rows: np.ndarray) -> Behind:
+        """With what stays, of which the rows [M] have other colours now."""
+        stays = np.flatnonzero(~self.masks.removed)
+        sh = self.scene.sh.copy()
+        sh[stays[rows]] = kept.sh[rows]
+        return replace(self, scene=replace(self.scene, sh=sh), changed=np.union1d(self.changed, stays[rows]))
 
 
 def remove_object(
@@ -116,6 +151,61 @@ def look(
     return look_behind(run, scene, region, masks, photos, shadow_masks)
 
 
+def look_behind(
+    run: Run,
+    scene: Gaussians,
+    region: Region,
+    masks: Masks,
+    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
+    shadow_masks: Mapping[str, np.ndarray],
+) -> Behind:
+    """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
+    settings, region, lit = run.settings, masks.grown(region), NOT_LIT
+    if not masks.removed.any():
+        return Behind(scene, scene, lit.rows, masks, (), (), lit)
+    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos, words=levelled)
+    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures))
+    if settings.charts is None or masks.mode != "need":
+        return Behind(scene, scene, lit.rows, masks, views, (), lit)
+    inputs = scene, region, masks, views, settings
+    surfaces = run("surfaces", find_surfaces, *inputs)
+    masks = replace(masks, selection=surfaces.selection)
+
+    def in_light(found: Found, suffix: str = "") -> tuple[Relit, Charted]:
+        """What the object does to the light undone, and the charts as they are then."""
+        light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
+        lit = Relit(found, light)
+        bounded = surfaces if light is None else surfaces.with_marked(light.dark)
+        inputs = lit.scene(scene), region, bounded, lit.views(views), settings
+        return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
+
+    found = NOT_LIT.found
+    if settings.shadow != "off":
+        found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
+        if isinstance(found.shadow, str) and settings.shadow == "mask":
+            run.warnings.append(found.shadow)
+    lit, charted = in_light(found)
+    if isinstance(found.shadow, str) and settings.shadow == "auto":
+        found = run("contact", with_contact, found, charted.charts)
+        again = not isinstance(found.shadow, str)
+        lit, charted = in_light(found, " 2") if again else (Relit(found, lit.lifted), charted)
+    if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
+        surfaces = run("surfaces 2", find_surfaces, *inputs, False)
+        masks = replace(masks, selection=surfaces.selection)
+        lit, charted = in_light(found, " 3")
+    scene, views = lit.scene(scene), lit.views(views)
+    if charted.charts:
+        targets = charted.targets
+        masks = replace(masks, selection=charted.selection, views=targets.views)
+        views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
+    behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
+    if not settings.refine.steps:
+        return behind
+    given = scene, region, masks.removed, views, charted.charts, settings, run.progress
+    learned = run("relearn", relearn, *given)
+    return replace(behind, scene=learned.scene(scene), changed=np.union1d(lit.rows, learned.rows))
+
+
 def _filled(
     run: Run, views: Sequence[View], behind: Behind, reference: str | None, reference_image: np.ndarray | None
 ) -> RemovalResult:
@@ -126,6 +216,7 @@ def _filled(
         return _result(run, masks, NOT_LIT)
     to_paint = charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
+    run.pictures += pictures.of_light(behind.lit, [v.id for v in behind.views])
     run.pictures += pictures.of_charts(to_paint)
     run.pictures += pictures.of_growth(behind.scene, masks, behind.views)
     run.pictures += pictures.of_targets(behind.views)
@@ -248,5 +339,5 @@ def preview(view: ViewState, settings: RemovalSettings) -> list[Picture]:
         except IllPosed:
             return shown  # the region is worth seeing all the more
         depth = np.where(target, completed.depth, view.left.depth_after).astype(np.float32)
-        shown += pictures.of_depth(completed, depth, target, view.photo, view.id)
+        shown += pictures.of_depth(completed, depth, target, view.id)
     return shown

@@ -21,7 +21,7 @@ from .io.images import write_png
 from .io.ply import SplatFile
 from .job import RemovalJob
 from .memory import peak_memory_mb
-from .pictures import RULE_COLOURS, draw
+from .pictures import RULE_COLOURS
 from .presets import RemovalSettings
 from .progress import count_words
 from .raster import render_bytes
@@ -178,9 +178,9 @@ def write_removal_report(
             parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
     for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
-        write_png(folder / f"chart_{number}.png", draw(picture))
+        write_png(folder / f"chart_{number}.png", picture.draw())
     for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
-        write_png(folder / f"stage_{k:02d}.png", draw(picture))
+        write_png(folder / f"stage_{k:02d}.png", picture.draw())
         wide = " class=wide" if picture.kind in ("rules", "shadow", "refined") else ""
         parts["pictures"].append(_figure(_image(f"stage_{k:02d}.png"), picture.title, wide))
     page = _page(summary, parts, result)

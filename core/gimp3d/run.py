@@ -42,14 +42,11 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Picture:
-    """A stage's result to look at; `report` draws it by its kind."""
+    """A stage's result to look at."""
 
     kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules | refined
     title: str
-    image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (hole) | (light that arrives, lifted) | (depth, target) | (ring, line, s_f) | (target)
-    # | (rows, cols) | (rules, raw) | (the view before)
-    data: tuple[np.ndarray, ...]
+    draw: Callable[[], np.ndarray]  # [H, W, 3] uint8, where somebody looks
 
 
 @dataclass(frozen=True)
