@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from gimp3d.evaluate.benchmark import telea
+from gimp3d.evaluate import telea
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, render_bytes
 

@@ -344,7 +344,7 @@ def _orbit(given: Namespace, _: Reporter) -> None:
 
 
 def _evaluate(given: Namespace, _: Reporter) -> None:
-    from .evaluate.metrics import evaluate_folders
+    from .evaluate import evaluate_folders
 
     scores = evaluate_folders(**_values(given, "json"))
     if given.json:
@@ -358,7 +358,7 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
 
 def _bench(given: Namespace, shown: Reporter) -> None:
     from .compute.threads import set_thread_count
-    from .evaluate.benchmark import run_benchmark, table
+    from .evaluate import run_benchmark, table
     from .pipeline import PRESETS
 
     unknown = [p for p in given.presets if p not in PRESETS]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,12 +20,12 @@ from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
 from .stages.view_refinement import ViewRefinement
+from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed
 from .view_state import ViewState
 
-T = TypeVar("T")
-SPREAD = 3  # views that are shown of many
+FEW = 3  # views that are shown of many
 SHOWN = 0.25  # blend weight of what the boxes cut off from which a pixel is marked
 RULE_COLOURS = {
     Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
@@ -39,15 +39,9 @@ RED = (230, 60, 60)
 PLOT_LOW, PLOT_HIGH = 56, 424  # px between which a plot of 480 px has its axes
 
 
-def spread(items: Sequence[T]) -> list[T]:
-    """A few of many, evenly."""
-    return [items[k * len(items) // SPREAD] for k in range(min(SPREAD, len(items)))]
-
-
 def of_targets(views: Sequence[ViewState]) -> list[Picture]:
-    return [
-        Picture("mask", f"Region to fill in {v.id}", partial(tinted, v.photo, v.left.target)) for v in spread(views)
-    ]
+    few = spread(views, FEW)
+    return [Picture("mask", f"Region to fill in {v.id}", partial(tinted, v.photo, v.left.target)) for v in few]
 
 
 def of_charts(charts: Sequence[Chart]) -> list[Picture]:
@@ -106,7 +100,7 @@ def of_reference(completed: Completed, field: MappingField | None) -> list[Pictu
 def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Picture]:
     """Filled views: raw, blended, and by which rule."""
     before, shown = {v.id: v.painted for v in views}, []
-    for p in spread(painting.views):
+    for p in spread(painting.views, FEW):
         was = before[p.camera_id]
         maps = p.pasted(was), p.rule_map(*was.shape[:2]), p.pasted(was, p.raw)
         shown.append(Picture("rules", f"Filled view {p.camera_id}", partial(by_rule, *maps)))
@@ -120,7 +114,7 @@ def of_refinement(asked: ViewRefinement, views: Sequence[ViewState]) -> list[Pic
         for a in asked.views
         if a.image is not None
     ]
-    return spread(shown)
+    return spread(shown, FEW)
 
 
 def by_rule(image: np.ndarray, rules: np.ndarray, raw: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from .priors.inpaint import check_provider, painter
 from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
-from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View
 from .stages.charts import Chart
 from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks, find_masks
@@ -82,7 +82,7 @@ def remove_object(
     extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
     shadow_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, for shadow="mask": its shadow
     allow_network: bool = False,  # whether providers may send pictures off this machine
-    observer: Observer = unobserved,  # runs each stage: to watch it, or to replace it
+    observer: Observer | None = None,  # runs each stage: to watch it, or to replace it
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid: the stages of docs/method.md, in their order.
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
@@ -28,17 +28,9 @@ from .raster import render_bytes
 from .run import RemovalResult, View
 from .stages.charts import Chart
 from .stages.reference import ReferenceChoice
+from .stages.verdict import Verdict
+from .stages.witness import spread
 
-MEANINGS = {  # of the verdict's figures
-    "open_share": "share of the hole that stays open",
-    "remains": "share of the object's pixels that still look like it",
-    "haze": "blend weight before the surface behind the object",
-    "ring_fidelity": "dB that the surroundings gained or lost against photos",
-    "sharpness": "detail of what was filled over that of its surroundings",
-    "agreement": "share of the object's pixels that look as photos, or other views, show the place",
-    "invented": "share of the object's pixels that no photo and no picture shows",
-    "expected_error": "dB by which the object's pixels are probably worse than its surroundings were",
-}
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
 STYLE = """
@@ -162,7 +154,7 @@ def write_removal_report(
         write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
 
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
-    for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
+    for k, view in enumerate(spread(views, 6)):
         for name, gaussians in (("before", scene), ("after", after)):
             write_drawn(f"{name}_{k}.png", gaussians, view)
         pair = f"<div class=flip>{_image(f'before_{k}.png', 'before')}{_image(f'after_{k}.png', 'after')}</div>"
@@ -267,7 +259,11 @@ def _verdict(verdict: dict[str, Any] | None) -> str:
         return ""
     score, words = verdict["score"], [escape(w) for w in verdict["words"]]
     bar = f"<div><div style='width:{score:.0%};background:hsl({120 * score:.0f} 60% 45%)'></div></div>"
-    figures = ((n.replace("_", " "), f"{verdict[n]:.3f}", m) for n, m in MEANINGS.items() if verdict[n] is not None)
+    figures = (
+        (name.replace("_", " "), f"{verdict[name]:.3f}", kind.__metadata__[0])
+        for name, kind in get_type_hints(Verdict, include_extras=True).items()
+        if get_origin(kind) is Annotated and verdict[name] is not None
+    )
     return (
         f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{''.join(f'<li>{w}</li>' for w in words[1:])}</ul>"
         f"<details><summary>What the score is made of</summary>{_table('.n.', figures)}</details>"

@@ -82,18 +82,9 @@ class Store(Protocol):
     def save(self, name: str, result: Any) -> None: ...
 
 
-class Observer(Protocol):
-    """Runs a stage: may look at what goes in and comes out, or do something else in its place.
-
-    `name` is the stage's ("masks", "propagate 2" in the second round), `work` its function, `inputs` what that takes.
-    """
-
-    def __call__(self, name: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any: ...
-
-
-def unobserved(name: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
-    """The observer that only runs the stage."""
-    return work(*inputs)
+# Runs a stage by its name ("masks", "propagate 2" in the second round), its function and what that takes: may look at
+# what goes in and comes out, or do something else in its place.
+Observer = Callable[[str, Callable[..., Any], tuple[Any, ...]], Any]
 
 
 def counted(new: Gaussians) -> tuple[float, str]:
@@ -109,7 +100,7 @@ class Run:
     progress: Progress = silent
     store: Store | None = None
     allow_network: bool = False
-    observer: Observer = unobserved
+    observer: Observer | None = None
     stages: list[StageReport] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
@@ -127,7 +118,7 @@ class Run:
         start = time.perf_counter()
         result = self.store.load(name) if self.store else None
         if result is None:
-            result = self.observer(name, work, inputs)
+            result = self.observer(name, work, inputs) if self.observer else work(*inputs)
             if self.store:
                 self.store.save(name, result)
         confidence, reason = words(result) if words else (result.confidence, result.reason)

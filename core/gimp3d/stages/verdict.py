@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from ..solvers.kriging import foretell, variogram
 from .charts import Chart, Hits
 from .masks import ViewMasks
 from .propagate import Reference
-from .witness import Says, Witness, ask
+from .witness import Says, Witness, ask, spread
 
 VIEWS = 8  # that are looked at, spread evenly
 POINTS = 24_000  # pixels of the object in these views
@@ -51,21 +52,22 @@ SOUND = (  # figures of the verdict, between which values nothing is amiss, and 
     ("agreement", 0.7, 1, "only {:.0%} of the object's place looks as photos show it: mark shadows and reflections"),
     ("invented", 0, 0.3, "no photo shows {:.0%} of the object's place: paint one view if the fill does not convince"),
 )
+Told = float | None  # None: nothing tells
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the removal is worth (docs/method.md, the verdict). None: there is nothing that tells."""
+    """What the removal is worth (docs/method.md, the verdict), and what its figures mean."""
 
     score: float  # 0 bad … 1 good
-    open_share: float  # of the hole's pixels
-    remains: float  # share of the object's pixels that still look like it
-    haze: float | None  # blend weight before the charts, mean over the object's pixels
-    ring_fidelity: float | None  # dB, PSNR against photos round the object: after less before
-    sharpness: float | None  # detail of what was filled over that of its surroundings
-    agreement: float | None  # share of the object's pixels that look as photos, or other views, show the place
-    invented: float  # share of the object's pixels that nothing tells
-    expected_error: float  # dB by which the object's pixels are worse than the surroundings were
+    open_share: Annotated[float, "share of the hole that stays open"]
+    remains: Annotated[float, "share of the object's pixels that still look like it"]
+    haze: Annotated[Told, "blend weight before the surface behind the object"]
+    ring_fidelity: Annotated[Told, "dB that the surroundings gained or lost against photos"]
+    sharpness: Annotated[Told, "detail of what was filled over that of its surroundings"]
+    agreement: Annotated[Told, "share of the object's pixels that look as photos, or other views, show the place"]
+    invented: Annotated[float, "share of the object's pixels that no photo and no picture shows"]
+    expected_error: Annotated[float, "dB by which the object's pixels are probably worse than its surroundings were"]
     words: tuple[str, ...]
 
 
@@ -98,7 +100,6 @@ class _Sample:
     variance: np.ndarray  # of true colours about those that are expected
     points: np.ndarray  # [N, 3]
     drawn: np.ndarray  # [N, 3] float32, grey levels
-    look: np.ndarray  # whose pixel it is
 
     @property
     def unseen(self) -> np.ndarray:
@@ -124,7 +125,6 @@ def judge(
     showing = [v for v in asked if v.silhouette.any()]
     if not showing:
         return None
-    count = min(VIEWS, len(showing))
 
     def look(view: ViewMasks) -> _Look:
         photo = photos[view.camera.id].astype(np.float32)
@@ -146,23 +146,23 @@ def judge(
                 off[on] = height[met.rows[on], met.cols[on]]
         return _Look(view, photo, ring, before, after, depth, chart, off, haze, error)
 
-    looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
+    looks = parallel_map(look, spread(showing, VIEWS))
     total = sum(int(look.view.silhouette.sum()) for look in looks)
     step = max(1, round(math.sqrt(total / POINTS)))
     tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
-    parts = parallel_map(lambda k: _sampled(looks, k, step, witnesses, tolerance, given), range(count))
-    sample = _Sample(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Sample)))
+    parts = parallel_map(lambda look: _sampled(look, step, witnesses, tolerance, given), looks)
     open_share = sum(int(m.sum()) for m in still_open) / max(1, sum(int(v.target.sum()) for v in views))
-    return _summed(looks, sample, open_share, bool(photographed), bool(charts))
+    return _summed(looks, parts, open_share, bool(photographed), bool(charts))
 
 
 def _summed(
-    looks: Sequence[_Look], sample: _Sample, open_share: float, with_photos: bool, with_charts: bool
+    looks: Sequence[_Look], parts: Sequence[_Sample], open_share: float, with_photos: bool, with_charts: bool
 ) -> Verdict:
+    sample = _Sample(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Sample)))
     error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
     before = _mean(*(_squared(look.before, look.photo)[look.ring] for look in looks))
     after = _mean(*(_squared(look.after, look.photo)[look.ring] for look in looks))
-    added, alike = _added_error(sample), _alike(looks, sample)
+    added, alike = _added_error(sample), _alike(looks, parts, sample)
     verdict = Verdict(
         score=1 / (1 + added / (HALF * error)),
         open_share=open_share,
@@ -192,7 +192,7 @@ def _added_error(sample: _Sample) -> float:
     return float(np.average(errors, weights=[int(where.sum()) for where in (photo, picture, unseen)]))
 
 
-def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
+def _alike(looks: Sequence[_Look], parts: Sequence[_Sample], sample: _Sample) -> np.ndarray:
     """[N] bool: pixels of the object that differ from photos, else from other views, as is usual round it."""
     usual = sample.usual[~sample.object]
     limit = max(LEAST_ERROR, float(np.percentile(usual, 95)) if len(usual) else 0.0)
@@ -201,10 +201,9 @@ def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
         for look in looks
     ]
     found = [sample.missed[sample.object & sample.told] <= limit]
-    for k in range(len(looks)):
-        own = sample.unseen & (sample.look == k)
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[own])
-        found.append((_squared(sample.drawn[own], colours) <= limit)[seen])
+    for k, part in enumerate(parts):
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], part.points[part.unseen])
+        found.append((_squared(part.drawn[part.unseen], colours) <= limit)[seen])
     return np.concatenate(found)
 
 
@@ -223,7 +222,7 @@ def _mean(*parts: np.ndarray) -> float:
     return float(all_.mean(dtype=np.float64)) if len(all_) else 0.0
 
 
-def _sharpness(looks: Sequence[_Look]) -> float | None:
+def _sharpness(looks: Sequence[_Look]) -> Told:
     """Median detail of what was filled, over that of the same surfaces round the object."""
     filled, beside = [], []
     for look in looks:
@@ -239,10 +238,10 @@ def _sharpness(looks: Sequence[_Look]) -> float | None:
 
 
 def _sampled(
-    looks: Sequence[_Look], k: int, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
+    look: _Look, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
 ) -> _Sample:
-    look, thin = looks[k], np.s_[::step, ::step]
-    camera, object_ = look.view.camera, look.view.silhouette[thin]
+    thin, camera = np.s_[::step, ::step], look.view.camera
+    object_ = look.view.silhouette[thin]
     ring, photo, after, depth, chart = (a[thin] for a in (look.ring, look.photo, look.after, look.depth, look.chart))
     others = [w for w in witnesses if w.camera.id != camera.id]
     centres = camera.pixel_centres()[thin]
@@ -277,7 +276,7 @@ def _sampled(
     remains = object_ & along & (_squared(photo, expected) > UNLIKE**2)
     errors = (_squared(drawn, expected) for drawn in (look.before[thin], after))
     kept = object_ | (ring & told)
-    maps = object_, told, by_picture, remains, *errors, variance, points, after, np.full(kept.shape, k)
+    maps = object_, told, by_picture, remains, *errors, variance, points, after
     return _Sample(*(m[kept] for m in maps))
 
 

@@ -69,6 +69,12 @@ def ask(witnesses: Sequence[Witness], points: np.ndarray, tolerance: float) -> n
     return np.array(parallel_map(of, witnesses), np.uint8).reshape(len(witnesses), len(points))
 
 
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """As many of the items, evenly."""
+    count = min(most, len(items))
+    return [items[k * len(items) // count] for k in range(count)]
+
+
 def total_over(items: Sequence[T], work: Callable[[T], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
     """The sum of arrays of a shape that `work` makes of items, such as views."""
     total = np.zeros(shape)
@@ -121,7 +127,6 @@ class Textures:
     @classmethod
     def make(cls, witnesses: Sequence[Witness], most: int = 32, shrink: int = 1) -> Textures:
         """Of `most` views, evenly chosen, in pictures smaller by a whole factor."""
-        count = min(len(witnesses), most)
 
         def of(witness: Witness) -> tuple[np.ndarray, np.ndarray]:
             hidden = witness.hidden | witness.beside  # the object's edge is no texture of what is beside it
@@ -134,8 +139,7 @@ class Textures:
             camera[16:] = w, h
             return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
 
-        used = [witnesses[k * len(witnesses) // count] for k in range(count)]
-        cameras, values = zip(*parallel_map(of, used))
+        cameras, values = zip(*parallel_map(of, spread(witnesses, most)))
         sizes = np.array([len(v) for v in values], np.int64)
         return cls(np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
 

@@ -9,7 +9,7 @@ import pytest
 from scenes import cameras, floor, truth
 
 from gimp3d.compute.threads import set_thread_count
-from gimp3d.evaluate.metrics import ssim_map
+from gimp3d.evaluate import ssim_map
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import Gradients, render

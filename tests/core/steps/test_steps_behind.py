@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scenes import BLOCK, REGION, cameras, floor, scene
 
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.gaussians import ARRAYS, Gaussians
 from gimp3d.geometry import dilated
 from gimp3d.pipeline import PRESETS, Behind, View, look_behind, remove_object, render_bytes
