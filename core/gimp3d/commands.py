@@ -109,24 +109,15 @@ def render_views(
     scene: Path,
     cameras: Path,
     out: Path,
-    split: str = "all",
+    split: str = "all",  # train | test | all
     frames: Sequence[str] | None = None,
     passes: Sequence[str] = ("rgb",),
-    scale: float = 1.0,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,  # of the pictures' width and height
+    background: Sequence[float] = (0.0, 0.0, 0.0),  # red, green, blue from 0 to 1
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
     """Draw the scene from its cameras into a folder, as `gimp3d render` does: one file for each frame and pass.
-
-    Parameters
-    ----------
-    split
-        train, test or all.
-    scale
-        Of the pictures' width and height.
-    background
-        Red, green, blue from 0 to 1.
 
     Raises
     ------
@@ -278,13 +269,6 @@ def run_removal(
     if job.device == "cuda":
         raise BadInput("--device cuda: there is no CUDA backend yet; use cpu or auto")
     settings = job_settings(job)
-    out = Path(job.out)
-    if out.suffix.lower() != ".ply" and not is_stream(out):
-        raise BadInput(f"--out: {out} must end in .ply")
-    if not 1 <= job.variants <= MOST_VARIANTS:
-        raise BadInput(f"--variants must be from 1 to {MOST_VARIANTS}, got {job.variants}")
-    if job.variants > 1 and is_stream(out):
-        raise BadInput(f"--variants: {out} takes one scene only")
     _try_targets(job, folder)
     progress("read", 0, 1, job.scene)
     file = read_scene(Path(job.scene))
@@ -317,33 +301,28 @@ def run_removal(
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
         results.append(remove_object(scene, views, region, of_variant, *given))
     summary = summary_of(job, settings, file, results, warnings, time.perf_counter() - start)
-    _write_beside(job, folder, scene, views, results, summary)
+    if job.views_out:
+        for name, image in results[0].painted.items():
+            write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
+        write_charts(Path(job.views_out) / "charts", results[0].charts)
+    if job.report:
+        write_removal_report(Path(job.report), scene, views, results, summary)
+    for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
+        write_json(Path(path), summary)
     for path, result in reversed(list(zip(job.outs(), results))):
         write_ply(path, file, result.keep, result.added)  # OUT last: as it was until all has gone well
     return summary
 
 
-def _write_beside(
-    job: RemovalJob,
-    folder: Path | None,
-    scene: Gaussians,
-    views: Sequence[View],
-    variants: Sequence[RemovalResult],
-    summary: dict[str, Any],
-) -> None:
-    """What a removal writes beside OUT: views, charts, report, summary."""
-    if job.views_out:
-        for name, image in variants[0].painted.items():
-            write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
-        write_charts(Path(job.views_out) / "charts", variants[0].charts)
-    if job.report:
-        write_removal_report(Path(job.report), scene, views, variants, summary)
-    for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
-        write_json(Path(path), summary)
-
-
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:
     """Sweep what killed runs left half-written, and see that everything can be written before the work starts."""
+    out = Path(job.out)
+    if out.suffix.lower() != ".ply" and not is_stream(out):
+        raise BadInput(f"--out: {out} must end in .ply")
+    if not 1 <= job.variants <= MOST_VARIANTS:
+        raise BadInput(f"--variants must be from 1 to {MOST_VARIANTS}, got {job.variants}")
+    if job.variants > 1 and is_stream(out):
+        raise BadInput(f"--variants: {out} takes one scene only")
     files = [*job.outs(), *(Path(p) for p in (job.summary, folder and folder / "summary.json") if p)]
     folders = [Path(p) for p in (job.report, job.views_out, folder and folder / "stages") if p]
     of_variants = folder.glob("stages/*/") if folder else ()

@@ -213,7 +213,7 @@ def _filled(
     settings, masks = run.settings, behind.masks
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
-        return _result(run, masks, NOT_LIT)
+        return _result(run, behind)
     to_paint = charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
     run.pictures += pictures.of_light(behind.lit, [v.id for v in behind.views])
@@ -239,10 +239,9 @@ def _filled(
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
     verdict = _judge(run, views, behind, filling, by_picture)
     completed = {r.camera.id: r.image for r in filling.done}
-    result = _result(
+    return _result(
         run,
-        masks,
-        behind.lit,
+        behind,
         added=filling.added,
         open_pixels=left,
         painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
@@ -250,25 +249,17 @@ def _filled(
         verdict=verdict,
         refined_views=filling.asked,
     )
-    return _with_changed(result, behind)
 
 
 def _judge(run: Run, views: Sequence[View], behind: Behind, filling: Filling, by_picture: bool) -> Verdict | None:
     """How good the result probably is; a reference whose picture was given is what it is held against."""
-    return run(
-        "verdict",
-        judge,
-        behind.before,
-        filling.kept.extended(filling.added),
-        behind.masks.views,
-        [v.left.target for v in filling.views],
-        {v.id: v.bare for v in filling.views},
-        {v.camera.id for v in views if v.is_photo},
-        behind.charts,
-        {v.id: v.hits for v in filling.views if v.hits is not None},
-        filling.done[0] if filling.done and by_picture else None,
-        words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
-    )
+    photos, photographed = {v.id: v.bare for v in filling.views}, {v.camera.id for v in views if v.is_photo}
+    hits = {v.id: v.hits for v in filling.views if v.hits is not None}
+    given = filling.done[0] if filling.done and by_picture else None
+    final, still_open = filling.kept.extended(filling.added), [v.left.target for v in filling.views]
+    inputs = behind.before, final, behind.masks.views, still_open, photos, photographed, behind.charts, hits, given
+    nothing = 1.0, "no view shows the object"
+    return run("verdict", judge, *inputs, words=lambda v: (v.score, "; ".join(v.words)) if v else nothing)
 
 
 def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
@@ -298,21 +289,15 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     return dict(zip((v.id for v in filling.views), parallel_map(finished, range(len(filling.views)))))
 
 
-def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
-    """The result with the Gaussians that stay, but not as they were: they count as removed and added."""
-    changed = np.zeros(len(result.keep), bool)
+def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+    """What stays, but not as it was, counts as removed and added."""
+    masks, stays = behind.masks, ~behind.masks.removed
+    changed = np.zeros(len(stays), bool)
     changed[behind.changed] = True
-    changed &= result.keep  # some were taken away since
-    if not changed.any():
-        return result
-    added = behind.scene.take(changed).extended(result.added)
-    return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
-
-
-def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+    changed &= stays  # some were taken away since
     return RemovalResult(
-        keep=~masks.removed,
-        added=added,
+        keep=stays & ~changed,
+        added=behind.scene.take(changed).extended(added) if changed.any() else added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
@@ -321,9 +306,10 @@ def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, 
         warnings=tuple(run.warnings),
         selection=masks.selection.counts,
         proposed=masks.proposed,
-        shadow=lit.shadow,
-        reflection=lit.reflection,
-        lifted=int((~masks.removed)[lit.rows].sum()),
+        shadow=behind.lit.shadow,
+        reflection=behind.lit.reflection,
+        lifted=int(stays[behind.lit.rows].sum()),
+        changed=int(changed.sum()),
         **more,
     )
 

@@ -114,9 +114,9 @@ def judge(
     still_open: Sequence[np.ndarray],  # [H, W] bool each: what no reference reached
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, with the object, at the splats' exposure
     photographed: Collection[str],  # IDs of those that are photos; others are drawn
-    charts: Sequence[Chart] = (),
-    hits: Mapping[str, Hits] | None = None,  # by ID
-    given: Reference | None = None,  # that a picture was given for
+    charts: Sequence[Chart],
+    hits: Mapping[str, Hits],  # by ID
+    given: Reference | None,  # that a picture was given for
 ) -> Verdict | None:
     """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
     asked = [v for v in views if v.camera.id in photographed] or list(views)
@@ -138,8 +138,7 @@ def judge(
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
         depth, haze = weights.surface_depth()[0], weights.footprint(floats)
         chart, off = np.zeros((2, *near.shape), np.float32)
-        met = (hits or {}).get(view.camera.id)
-        if met is not None:
+        if met := hits.get(view.camera.id):
             chart = met.depth
             for number, height in enumerate(unsure):
                 on = (met.depth > 0) & (met.chart == number)
