@@ -150,40 +150,36 @@ def write_removal_report(
     result, frame = variants[0], frame_of(scene, [v.camera for v in views])
     after = scene.take(result.keep).extended(result.added)
 
-    def write_drawn(name: str, gaussians: Gaussians, view: View) -> None:
-        write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
+    def drawn(gaussians: Gaussians, view: View) -> np.ndarray:
+        return render_bytes(frame.scene(gaussians), frame.camera(view.camera))
+
+    def image(name: str, picture: np.ndarray, words: str = "") -> str:
+        write_png(folder / name, picture)
+        return f"<img src='{name}' alt='{words}'>"
 
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
     for k, view in enumerate(spread(views, 6)):
-        for name, gaussians in (("before", scene), ("after", after)):
-            write_drawn(f"{name}_{k}.png", gaussians, view)
-        pair = f"<div class=flip>{_image(f'before_{k}.png', 'before')}{_image(f'after_{k}.png', 'after')}</div>"
+        before = image(f"before_{k}.png", drawn(scene, view), "before")
+        pair = f"<div class=flip>{before}{image(f'after_{k}.png', drawn(after, view), 'after')}</div>"
         parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
-    for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
-        write_png(folder / f"view_{k:02d}.png", image)
-        parts["flips"].append(_figure(_image(f"view_{k:02d}.png"), camera_id, " hidden" if k else ""))
+    for k, (camera_id, picture) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
+        parts["flips"].append(_figure(image(f"view_{k:02d}.png", picture), camera_id, " hidden" if k else ""))
     if len(variants) > 1:
-        view = max(views, key=lambda v: _touched(v, result))
+        touched = [int((result.painted.get(v.camera.id, v.image) != v.image).sum()) for v in views]
+        view = views[int(np.argmax(touched))]
         for k, variant in enumerate(variants, 1):
-            write_drawn(f"variant_{k}.png", scene.take(variant.keep).extended(variant.added), view)
-            parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
+            picture = drawn(scene.take(variant.keep).extended(variant.added), view)
+            parts["variants"].append(_figure(image(f"variant_{k}.png", picture), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
-    for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
-        write_png(folder / f"chart_{number}.png", picture.draw())
-    for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
-        write_png(folder / f"stage_{k:02d}.png", picture.draw())
-        wide = " class=wide" if picture.kind in ("rules", "shadow", "refined") else ""
-        parts["pictures"].append(_figure(_image(f"stage_{k:02d}.png"), picture.title, wide))
+    for number, shown in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
+        write_png(folder / f"chart_{number}.png", shown.draw())
+    for k, shown in enumerate(p for p in result.pictures if p.kind != "chart"):
+        wide = " class=wide" if shown.kind in ("rules", "shadow", "refined") else ""
+        parts["pictures"].append(_figure(image(f"stage_{k:02d}.png", shown.draw()), shown.title, wide))
     page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
-
-
-def _touched(view: View, result: RemovalResult) -> int:
-    """How many values of the view the removal changed."""
-    painted = result.painted.get(view.camera.id)
-    return 0 if painted is None else int((painted != view.image).sum())
 
 
 def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
@@ -249,10 +245,6 @@ def _figure(content: str, caption: str, attributes: str = "") -> str:
     return f"<figure{attributes}>{content}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def _image(name: str, words: str = "") -> str:
-    return f"<img src='{name}' alt='{words}'>"
-
-
 def _verdict(verdict: dict[str, Any] | None) -> str:
     """The score as a bar from red to green, what it comes to, and its figures."""
     if verdict is None:
@@ -284,8 +276,8 @@ def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
     for k, (chart, facts) in enumerate(zip(charts, summary.get("charts", ())), 1):
         numbers = (f"{facts['texels']:,}", f"{facts['hole_texels']:,}", f"{facts['photos_median']:.0f}")
         rows.append((f"chart:{k}", facts["kind"], *numbers, chart.reason))
-        figures += _figure(_image(f"chart_{k}.png", "hole"), f"chart:{k}, what photos show; red: the hole")
-        figures += _figure(_image(f"charts/{k}.png", "completed"), f"chart:{k}, completed")
+        figures += _figure(f"<img src='chart_{k}.png' alt='hole'>", f"chart:{k}, what photos show; red: the hole")
+        figures += _figure(f"<img src='charts/{k}.png' alt='completed'>", f"chart:{k}, completed")
     table = _table("..nnn.", rows, ("chart", "kind", "texels", "hole", "photos of a texel", "why"))
     words = "The surfaces behind the object, straight on. To paint one:"
     code = "<code>--reference chart:N --reference-image FILE</code>"

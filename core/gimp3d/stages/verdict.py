@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -38,17 +38,13 @@ LEAST_ERROR = 1.0  # of 8-bit pictures
 HALF = 9.0  # times the error of the surroundings that scores ½ when it is added: 10 dB worse
 GOOD, FAIR = 0.75, 0.5  # scores
 FINE = 2.0  # px, σ of the blur that leaves no detail
+OTHER_DETAIL = "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed"
 SOUND = (  # figures of the verdict, between which values nothing is amiss, and words for what is
     ("open_share", 0, 0.02, "{:.0%} of the hole is open: add views from other sides, or take the preset best"),
     ("remains", 0, 0.05, "{:.0%} of the object's place still looks like it: enlarge the box until all of it is inside"),
     ("haze", 0, 0.05, "haze covers {:.0%} of what was behind the object: enlarge the box, or add one round the haze"),
     ("ring_fidelity", -0.5, math.inf, "the surroundings lost {:.1f} dB against the photos: make the box tighter"),
-    (
-        "sharpness",
-        0.5,
-        2,
-        "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed",
-    ),
+    ("sharpness", 0.5, 2, OTHER_DETAIL),
     ("agreement", 0.7, 1, "only {:.0%} of the object's place looks as photos show it: mark shadows and reflections"),
     ("invented", 0, 0.3, "no photo shows {:.0%} of the object's place: paint one view if the fill does not convince"),
 )
@@ -87,8 +83,7 @@ class _Look:
     error: float  # mean squared error before the removal in as many pixels round the object as it has
 
 
-@dataclass(frozen=True)
-class _Sample:
+class _Sample(NamedTuple):
     """Pixels of looks' every n-th row and column, [N]: the object's, and beside it those whose colours are told."""
 
     object: np.ndarray  # bool, of the object; the others lie beside it
@@ -157,7 +152,7 @@ def judge(
 def _summed(
     looks: Sequence[_Look], parts: Sequence[_Sample], open_share: float, with_photos: bool, with_charts: bool
 ) -> Verdict:
-    sample = _Sample(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Sample)))
+    sample = _Sample(*map(np.concatenate, zip(*parts)))
     error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
     before = _mean(*(_squared(look.before, look.photo)[look.ring] for look in looks))
     after = _mean(*(_squared(look.after, look.photo)[look.ring] for look in looks))
@@ -260,8 +255,8 @@ def _sampled(
         depth_given = np.where(given.target, given.depth, 0)
         by_picture[left] = sees(given.camera, depth_given, points[left], tolerance)
         expected[by_picture] = colours_at(given.image, given.camera.project(points[by_picture])[0])
-    foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~object_ | told | by_picture)
     unknown = object_ & ~told & ~by_picture
+    foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~unknown)
     expected[unknown] = foretold[unknown]
     if given is not None:
         here, there = points - camera.centre, points - given.camera.centre
@@ -314,10 +309,9 @@ def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence
         there, nearer = chart.there[rows, cols], z < chart.depth[rows, cols] - SCATTER * chart.noise
         before[index] |= there & nearer
         other[index] |= there & ~nearer
-    rows = np.flatnonzero(before & ~other & gaussians.usable)
-    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME_DEPTH))
-    found = np.zeros(len(points), bool)
-    found[rows] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
+    found = before & ~other & gaussians.usable
+    said = ask(witnesses, points[found], max([c.tolerance for c in charts], default=SAME_DEPTH))
+    found[found] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     return found
 
 

@@ -198,6 +198,6 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
 
 
 def test_nothing_to_judge(plain: Case, patch: Gaussians) -> None:
-    none = np.zeros((120, 160), bool)
+    none, photos = np.zeros((120, 160), bool), plain.photos
     views = [replace(v, silhouette=none, target=none) for v in plain.targets.views]
-    assert judge(plain.scene, plain.scene, views, [none] * len(views), plain.photos, set(plain.photos)) is None
+    assert judge(plain.scene, plain.scene, views, [none] * len(views), photos, set(photos), (), {}, None) is None
