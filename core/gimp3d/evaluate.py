@@ -104,13 +104,12 @@ def evaluate_folders(
     for folder in (pred, truth, masks):
         if not folder.is_dir():
             raise BadInput(f"evaluate: {folder} is not a folder")
-    left_out = {e: _stem_of_id(e) for e in exclude}
-    unused = set(left_out)
+    unused = set(exclude)
     views: dict[str, dict[str, float]] = {}
     warnings: list[str] = []
     for path in sorted(pred.rglob("*.png")):
         stem = path.relative_to(pred).as_posix().removesuffix(".png")
-        if named := [e for e, excluded in left_out.items() if _same_view(stem, excluded)]:
+        if named := [e for e in exclude if _names(e, stem)]:
             unused.difference_update(named)
             continue
         true = truth / f"{stem}.png"
@@ -131,21 +130,17 @@ def evaluate_folders(
     for path in sorted(truth.rglob("*.png")):
         stem = path.relative_to(truth).as_posix().removesuffix(".png")
         missing = (masks / f"{stem}{mask_suffix}").exists() and not (pred / f"{stem}.png").exists()
-        if missing and not any(_same_view(stem, e) for e in left_out.values()):
+        if missing and not any(_names(e, stem) for e in exclude):
             warnings.append(f"{stem}: no picture in {pred}, not scored")
     mean = {k: float(np.mean([v[k] for v in views.values()])) for k in ("psnr", "ssim", "flip")}
     return {"views": views, "mean": mean, "warnings": warnings}
 
 
-def _stem_of_id(camera_id: str) -> str:
-    """The stem that `render` gives a camera's picture: test/000 for ./test/000.jpg."""
-    path = PurePosixPath(camera_id)
-    return str(path.with_suffix("") if path.suffix.lower() in PHOTO_SUFFIXES else path)
-
-
-def _same_view(stem: str, excluded: str) -> bool:
-    """Whether two stems name one picture, either possibly with more leading folders."""
-    return stem == excluded or excluded.endswith("/" + stem) or stem.endswith("/" + excluded)
+def _names(excluded: str, stem: str) -> bool:
+    """Whether a stem or a camera ID (`render` makes test/000 of ./test/000.jpg) is a picture's, but for folders."""
+    path = PurePosixPath(excluded)
+    name = str(path.with_suffix("") if path.suffix.lower() in PHOTO_SUFFIXES else path)
+    return stem == name or name.endswith("/" + stem) or stem.endswith("/" + name)
 
 
 def run_benchmark(

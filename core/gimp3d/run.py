@@ -116,7 +116,7 @@ class Run:
         """The stage's result."""
         self.progress(name, 0, 1)
         start = time.perf_counter()
-        result = self.store.load(name) if self.store else None
+        result: Any = self.store.load(name) if self.store else None
         if result is None:
             result = self.observer(name, work, inputs) if self.observer else work(*inputs)
             if self.store:
