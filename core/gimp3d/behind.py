@@ -10,7 +10,7 @@ import numpy as np
 from . import pictures
 from .box import Region
 from .gaussians import Gaussians
-from .run import Run
+from .run import Run, ViewState
 from .stages.charts import Chart
 from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks
@@ -26,7 +26,6 @@ from .steps.behind import (
     undo_light,
     with_contact,
 )
-from .view_state import ViewState
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
 # stages that know nothing of fills

@@ -12,7 +12,7 @@ from .compute.threads import parallel_map
 from .gaussians import Gaussians
 from .geometry import disparity_of, window_mask
 from .raster import footprint, touched_window
-from .run import Picture
+from .run import Picture, ViewState
 from .stages.charts import Chart
 from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField
@@ -21,7 +21,6 @@ from .stages.propagate import Propagation, Rule
 from .stages.view_refinement import ViewRefinement
 from .steps.behind import Relit
 from .steps.references import Completed
-from .view_state import ViewState
 
 T = TypeVar("T")
 SPREAD = 3  # views that are shown of many

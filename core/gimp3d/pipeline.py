@@ -21,12 +21,11 @@ from .priors.inpaint import check_provider, painter
 from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
-from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels, unobserved
 from .stages.masks import Masks, find_masks
 from .stages.verdict import Verdict, judge
 from .steps.behind import NOT_LIT, Relit
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
-from .view_state import ViewState, open_pixels
 
 __all__ = [
     "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look", "preview",
