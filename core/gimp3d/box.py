@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import BadInput
+from .errors import BadInput, refusing
 from .gaussians import matrices_to_quats, quats_to_matrices
 from .schema import checked, read_json
 
@@ -46,10 +46,9 @@ class Box:
         >>> Box.make([0, 0, 0.5], [1, 1, 1]).contains(np.array([[0, 0, 0.9], [0, 0, 1.1]]))
         array([ True, False])
         """
-        try:
+        wrong = (TypeError, ValueError, OverflowError, RecursionError)
+        with refusing("ROI: numbers expected for center, size and rotation_wxyz", *wrong):
             c, s, q = (np.array(v, dtype=np.float64) for v in (center, size, rotation_wxyz))
-        except (TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise BadInput(f"ROI: numbers expected for center, size and rotation_wxyz ({error})") from None
         for name, value, length in (("center", c, 3), ("size", s, 3), ("rotation_wxyz", q, 4)):
             if value.shape != (length,) or not (np.abs(value) < LARGEST).all():  # NaN is not less either
                 raise BadInput(f"ROI: {name} must be {length} finite numbers")

@@ -71,7 +71,7 @@ def scene_info(path: Path) -> dict[str, Any]:
         "bounds_min": np.percentile(means, 1, axis=0).round(4).tolist(),
         "bounds_max": np.percentile(means, 99, axis=0).round(4).tolist(),
         "format": file.table.format,
-        "properties": [p.name for p in file.table.properties],
+        "properties": list(file.table.properties),
         "comments": list(file.table.comments),
     }
 

@@ -12,7 +12,7 @@ from . import pictures
 from .errors import IllPosed
 from .gaussians import Gaussians
 from .geometry import SAME_DEPTH
-from .run import Run, counted
+from .run import Run, ViewState, counted, open_pixels
 from .stages.charts import Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
@@ -37,7 +37,6 @@ from .steps.references import (
     texels_to_fill,
     with_answers,
 )
-from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
 REFINING = 0.5  # share of a painted hole that a refining painter may change (img2img's denoising strength)

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from .errors import BadInput
+from .errors import BadInput, refusing
 from .files import require_file, user_secret, user_state_folder, write_atomically
 from .schema import SETTING, Between, checked, kinds, parse_json
 
@@ -95,10 +95,8 @@ class RemovalJob:
 
 def save_job(folder: Path, job: RemovalJob) -> None:
     """Write `folder`/job.json (atomically), making the folder if needed, and remember that this user wrote it."""
-    try:
+    with refusing(f"job: cannot make the folder {folder}", OSError):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"job: cannot make the folder {folder} ({error.strerror})") from None
     # The mark makes the file's content one that nobody else can have written, see _record.
     document = {"version": JOB_VERSION, "mark": secrets.token_hex(16), **asdict(job.relative_to(folder))}
     text = json.dumps(document, indent=1).encode()
@@ -120,10 +118,8 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
     one that is damaged or of another version, or one that reaches out.
     """
     path, given = folder / "job.json", given or {}
-    try:
+    with refusing(f"job: {folder} holds no job.json; give SCENE, --cameras, --roi and --out", OSError):
         text = require_file(path).read_bytes()
-    except OSError:
-        raise BadInput(f"job: {folder} holds no job.json; give SCENE, --cameras, --roi and --out") from None
     try:
         document: dict[str, Any] = checked(dict[str, Any], parse_json(text, str(path), LARGEST_JOB), str(path))
     except BadInput as error:
@@ -215,11 +211,9 @@ class StageStore:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {k: file[k] for k in file.files}
             document = json.loads(bytes(arrays.pop("document")).decode())
-            if document["key"] != self.key or document["settings"] != self.settings:
-                return None
-            if not hmac.compare_digest(document["checksum"], self._checksum(document["result"], arrays)):
-                return None
-            return self._decode(document["result"], arrays)
+            result, fits = document["result"], (document["key"], document["settings"]) == (self.key, self.settings)
+            ours = fits and hmac.compare_digest(document["checksum"], self._checksum(result, arrays))
+            return self._decode(result, arrays) if ours else None
         except Exception:  # empty, damaged, somebody else's, of an older version: whatever it is, the stage runs again
             return None
 

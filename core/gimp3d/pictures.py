@@ -13,7 +13,7 @@ from .compute.threads import parallel_map
 from .gaussians import Gaussians
 from .geometry import disparity_of, window_mask
 from .raster import footprint, touched_window
-from .run import Picture
+from .run import Picture, ViewState
 from .stages.charts import Chart
 from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField
@@ -23,7 +23,6 @@ from .stages.view_refinement import ViewRefinement
 from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed
-from .view_state import ViewState
 
 FEW = 3  # views that are shown of many
 SHOWN = 0.25  # blend weight of what the boxes cut off from which a pixel is marked

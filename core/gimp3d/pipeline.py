@@ -20,7 +20,7 @@ from .priors.inpaint import check_provider, painter
 from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
-from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels, unobserved
 from .stages.charts import Chart
 from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks, find_masks
@@ -38,7 +38,6 @@ from .steps.behind import (
     with_contact,
 )
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
-from .view_state import ViewState, open_pixels
 
 __all__ = [
     "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look", "preview",

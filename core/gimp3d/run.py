@@ -1,9 +1,9 @@
-"""What goes into a removal and comes out, and how its stages are run: timed, kept, and open to whoever watches."""
+"""What goes into a removal, travels through it and comes out; how its stages are run: timed, kept, open to watchers."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -14,7 +14,10 @@ from .gaussians import Gaussians
 from .presets import RemovalSettings
 from .priors.calls import Call
 from .progress import Progress, silent
-from .stages.charts import Chart
+from .stages.charts import Chart, Hits
+from .stages.exposure import Exposure
+from .stages.masks import ViewMasks
+from .stages.propagate import Reference
 from .stages.reference import ReferenceChoice
 from .stages.verdict import Verdict
 
@@ -28,6 +31,40 @@ class View:
     camera: Camera
     image: np.ndarray  # [H, W, 3] uint8
     is_photo: bool = True  # False: drawn from the scene
+
+
+@dataclass(frozen=True)
+class ViewState:
+    """What is known of a view on its way through a removal; pictures are [H, W] of its camera."""
+
+    masks: ViewMasks  # what the object touched, and where the view has to be filled
+    photo: np.ndarray  # [H, W, 3] uint8, with the object, as it came
+    exposure: Exposure  # of the photo over the splats'
+    bare: np.ndarray  # [H, W, 3] uint8, the photo at the splats' exposure, the object's shadow and reflection undone
+    painted: np.ndarray  # [H, W, 3] uint8, the same without the object, as far as that is known
+    left: ViewMasks  # the masks as they are now: T shrinks with every reference
+    hits: Hits | None = None  # where its rays meet charts; None without them
+    rules: np.ndarray | None = None  # [H, W] Rule that gave each pixel its last colour; None: nothing was painted yet
+    best: tuple[int, Reference] | None = None  # the reference that painted most of it, and how many pixels it did
+
+    @classmethod
+    def first(cls, masks: ViewMasks, photo: np.ndarray, exposure: Exposure) -> ViewState:
+        """A view of which nothing is known but its photo and what has to be filled of it."""
+        level = exposure.level(photo)
+        return cls(masks, photo, exposure, level, level, masks)
+
+    @property
+    def camera(self) -> Camera:
+        return self.masks.camera
+
+    @property
+    def id(self) -> str:
+        return self.masks.camera.id
+
+
+def open_pixels(views: Sequence[ViewState]) -> int:
+    """What is still to be filled, in all views."""
+    return sum(int(v.left.target.sum()) for v in views)
 
 
 @dataclass(frozen=True)

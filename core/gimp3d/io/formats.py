@@ -80,7 +80,7 @@ def _from_compressed_ply(path: Path) -> Gaussians:
     data, tables = path.read_bytes(), {}
     with refusing(f"{path}: a damaged compressed PLY", KeyError, ValueError):
         for element in elements:
-            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
+            kind = np.dtype([(n, "<" + TYPES[kind]) for n, kind in element.properties.items() if kind != "list"])
             if offset + element.count * kind.itemsize > len(data):
                 raise BadInput(f"{path} is truncated: element {element.name} is not whole")
             tables[element.name] = np.frombuffer(data, kind, element.count, offset)
@@ -156,10 +156,8 @@ def _inflated(data: bytes, size: int) -> bytes:
 
 def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
     """The body that the streams of version 4 make up, of so many bytes."""
-    try:
+    with refusing(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard", ImportError):
         import zstandard
-    except ImportError:
-        raise BadInput(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard") from None
     table = int.from_bytes(data[16:20], "little")  # of the streams, whose number is the header's last byte
     offset = table + 16 * data[15]
     if len(data) < max(20, offset):
@@ -240,12 +238,10 @@ def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
 
 def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     """A picture [H, W, 4] uint8, RGBA, of at most so many pixels."""
-    try:
+    with refusing(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert", ImportError):
         import cv2
 
         from .images import announced_pixels, decoded
-    except ImportError:
-        raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
     if announced_pixels(data) > most:
         raise BadInput(f"{path}: a picture of the SOG scene is far larger than its count needs")
     picture = decoded(data, f"{path}: a part of the SOG scene")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ..gaussians import linear
 from ..solvers.lights import LitSurface, Shading
-from ..srgb import linear
 from .charts.plane import Plane
 from .ground import Ground
 from .occluder import Occluder

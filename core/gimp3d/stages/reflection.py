@@ -13,10 +13,9 @@ from scipy.optimize import nnls
 from ..box import Region
 from ..camera import Camera
 from ..compute.threads import parallel_map
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, decoded, linear
 from ..geometry import colours_at
 from ..raster import render
-from ..srgb import decoded, linear
 from .charts.plane import Plane, extent
 from .ground import ROUGH, Ground
 from .light_search import EARNS, FITS, places_elsewhere

@@ -19,10 +19,9 @@ import scipy.ndimage
 from scipy.spatial import cKDTree
 
 from ..box import Region
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, linear
 from ..geometry import colours_at, dilated
 from ..solvers.lights import Shading
-from ..srgb import linear
 from .charts import Chart
 from .charts.plane import Plane, extent
 from .ground import FEWEST, ROUGH, Ground

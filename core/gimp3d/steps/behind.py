@@ -21,6 +21,7 @@ from ..gaussians import SH_C0, Gaussians
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
+from ..run import ViewState
 from ..stages.charts import Chart, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
 from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
 from ..stages.ground import look_at
@@ -33,7 +34,6 @@ from ..stages.seed import OWN_RULES
 from ..stages.selection import Selection, near_region
 from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
 from ..stages.witness import Witness, total_over
-from ..view_state import ViewState
 from .references import emptied
 
 NO_SHADOW = {"found": False, "lights": [], "explained": 0.0}

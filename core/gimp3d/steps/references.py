@@ -26,6 +26,7 @@ from ..priors.monodepth import depth_prior, looks
 from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
+from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.mapping import MappingField, mapping_field, source_visibility
@@ -35,7 +36,6 @@ from ..stages.reference import rim
 from ..stages.refine import looked_at
 from ..stages.seed import seed_gaussians, settle_gaussians
 from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
-from ..view_state import ViewState
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z

@@ -13,6 +13,7 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.geometry import dilated
 from gimp3d.presets import PRESETS
 from gimp3d.raster import footprint, render_bytes, surface_depth
+from gimp3d.run import ViewState
 from gimp3d.stages.charts import Chart, Plane, lay_planes
 from gimp3d.stages.clearing import (
     ClearingSettings,
@@ -30,7 +31,6 @@ from gimp3d.stages.masks import Masks, ViewMasks
 from gimp3d.stages.selection import Fate, Selection
 from gimp3d.stages.witness import Says, Witness, ask
 from gimp3d.steps.behind import find_surfaces
-from gimp3d.view_state import ViewState
 
 UP = np.array([0.0, 0, 1])
 EYES = cameras(9, 160, 120)

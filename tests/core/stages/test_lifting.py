@@ -13,13 +13,13 @@ from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.presets import PRESETS
 from gimp3d.raster import render_bytes
+from gimp3d.run import ViewState
 from gimp3d.stages.exposure import exposures_of
 from gimp3d.stages.lifting import Arriving, _lifted, light_in, recoloured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
 from gimp3d.steps.behind import find_light, find_surfaces
-from gimp3d.view_state import ViewState
 
 
 @cache
