@@ -12,17 +12,18 @@ from . import pictures
 from .errors import IllPosed
 from .gaussians import Gaussians
 from .geometry import SAME_DEPTH
+from .priors.inpaint import painter
 from .run import Run, counted
-from .stages.charts import Chart
+from .stages.charts import CHART, Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
-from .stages.refine import observed, refine_gaussians
+from .stages.refine import looked_at, observed, refine_gaussians
+from .stages.seed import seed_gaussians, settle_gaussians
 from .steps.behind import take_painted_colours
 from .steps.references import (
     Completed,
     Turn,
     after_reference,
-    ask_to_refine,
     carried_over,
     complete_view_depth,
     emptied,
@@ -31,12 +32,10 @@ from .steps.references import (
     paint_chart,
     paint_view,
     paint_views,
-    seed_surface,
-    settle_seeds,
     snapped,
     texels_to_fill,
-    with_answers,
 )
+from .steps.view_refinement import refine_views
 from .view_state import ViewState, open_pixels
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
@@ -93,7 +92,7 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
     name = f"appearance{suffix}"
     appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    return Completed(chart.camera, appearance.image, chart.depth, target, ~target & ~hole & chart.known, (chart,))
+    return Completed(chart.camera, appearance.image, chart.depth, target, ~target & chart.known, (chart,))
 
 
 def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
@@ -125,10 +124,11 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
 def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
     """A completed reference in every view, and the Gaussians that show it."""
     settings, views, filled = run.settings, filling.views, filling.kept.extended(filling.added)
-    seeds = run(f"seed{suffix}", seed_surface, completed, filled.is_surfels, settings, words=counted)
+    camera, of_seeds = completed.camera, settings.seed
+    surface = completed.image, completed.depth, completed.target, filled.is_surfels, of_seeds, camera.split == CHART
+    seeds = run(f"seed{suffix}", seed_gaussians, camera, *surface, words=counted)
     if len(seeds) == 0:
-        name = completed.camera.id
-        raise IllPosed(f"reference {name}: what is behind the object is infinitely far; nothing to build")
+        raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
     sampled = settings.propagate.transfer == "sample"
     field_ = run(f"mapping{suffix}", map_reference, completed, views, settings) if sampled else None
     with_seeds = filled.extended(seeds)
@@ -136,7 +136,8 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
-    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
+    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
+    new = run(f"settle{suffix}", settle_gaussians, filled, seeds, camera, looks, of_seeds, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
     views = after_reference(views, painting.views, completed, filled, new, len(added))
@@ -147,12 +148,14 @@ def ask_for_refinement(run: Run, filling: Filling) -> Filling:
     """The painted views, refined by a painter that sees their reference beside them if the user asked for one."""
     if not run.settings.refine_views:
         return filling
-    call = run.call("--refine-views", "refine views", REFINING)
-    asked = run(call.stage, ask_to_refine, filling.views, run.settings, call)
+    call, settings = run.call("--refine-views", "refine views", REFINING), run.settings
+    who = painter(settings.refine_views, call)
+    views = looked_at([v for v in filling.views if v.best is not None], settings.refine)
+    asked = run(call.stage, refine_views, who, views, settings.random_seed, call)
     run.warnings += asked.warnings
     run.pictures += pictures.of_refinement(asked, filling.views)
-    facts = {"provider": run.settings.refine_views, **asked.facts()}
-    return replace(filling, views=with_answers(filling.views, asked), asked=facts)
+    facts = {"provider": settings.refine_views, **asked.facts()}
+    return replace(filling, views=asked.applied(filling.views), asked=facts)
 
 
 def refine(run: Run, filling: Filling) -> Filling:

@@ -18,9 +18,9 @@ from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
-from .stages.view_refinement import ViewRefinement
 from .steps.behind import Relit
 from .steps.references import Completed
+from .steps.view_refinement import ViewRefinement
 from .view_state import ViewState
 
 T = TypeVar("T")

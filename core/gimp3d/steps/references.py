@@ -1,7 +1,7 @@
 """References without the object: which comes next, its depth and picture, and how it is carried into all views.
 
 A completed reference is tiled with Gaussians; views are painted with it, and the Gaussians take the colours that views
-were painted with. What no reference reaches stays open. A painter that the user named may refine painted views.
+were painted with. What no reference reaches stays open.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ..gaussians import Gaussians
 from ..geometry import SOLID, colours_at, dilated, disparity_of, sees, window_mask
 from ..presets import RemovalSettings
 from ..priors.calls import Call
-from ..priors.inpaint import PROVIDERS, inpaint_reference, painter
-from ..priors.monodepth import depth_prior, looks
+from ..priors.inpaint import PROVIDERS, inpaint_reference
+from ..priors.monodepth import depth_prior
 from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
@@ -32,9 +32,6 @@ from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.reference import rim
-from ..stages.refine import looked_at
-from ..stages.seed import seed_gaussians, settle_gaussians
-from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
 from ..view_state import ViewState
 
 SAME = 0.01  # relative z within which two references show the same surface
@@ -67,10 +64,7 @@ def turns_of(
 ) -> list[Turn]:
     """In which order references are completed, as far as there is something left to fill.
 
-    Raises
-    ------
-    BadInput
-        If the chart that is named does not exist.
+    Raises BadInput if the chart that is named does not exist.
     """
     number, count = chart_number(reference), len(charts)
     if number is not None:
@@ -157,15 +151,14 @@ def complete_view_depth(
         share = float((there[masks.target] > 0).mean())
         words = f"{share:.0%} of the hole lies on charts"
         return DepthCompletion(disparity_of(depth), depth, share, words, PriorFit())
-    looked_at = None
-    spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
-    if looks(spec):
+
+    def without_object() -> np.ndarray:
         if picture is not None:
-            pasted = paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette)
-        else:
-            pasted = inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=ask)
-        looked_at = pasted.image
-    prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
+            return paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette).image
+        return inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=ask).image
+
+    spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
+    prior = depth_prior(spec, masks.camera.height, masks.camera.width, without_object, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
     depth_settings = replace(settings.depth, surface=surface)
     known = rim(masks) & ~masks.occluder
@@ -199,12 +192,6 @@ def emptied(kept: Gaussians, views: Sequence[ViewState]) -> tuple[ViewState, ...
         return replace(view, painted=np.where(silhouette[..., None], drawn, view.bare))
 
     return tuple(parallel_map(empty, views))
-
-
-def seed_surface(completed: Completed, surfels: bool, settings: RemovalSettings) -> Gaussians:
-    """Gaussians that tile the completed surface."""
-    c = completed
-    return seed_gaussians(c.camera, c.image, c.depth, c.target, surfels, settings.seed, c.camera.split == CHART)
 
 
 def map_reference(completed: Completed, views: Sequence[ViewState], settings: RemovalSettings) -> MappingField:
@@ -253,19 +240,6 @@ def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarra
     depths are rough, photos place charts.
     """
     return np.where((there > 0) & (np.abs(depth - there) < tolerance * there), there, depth)
-
-
-def settle_seeds(
-    completed: Completed,
-    seeds: Gaussians,
-    filled: Gaussians,  # the scene without the object and without the seeds
-    views: Sequence[ViewState],
-    painting: Propagation,
-    settings: RemovalSettings,
-) -> Gaussians:
-    """The seeds that are needed, in the colours of the painted views."""
-    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
-    return settle_gaussians(filled, seeds, completed.camera, looks, settings.seed)
 
 
 def after_reference(
@@ -338,28 +312,3 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     joined &= at_edge | (depth < (1 + LAYER_STEP) * farthest)
     wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * MARGIN,) * 2, np.uint8)) > 0
     return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
-
-
-def ask_to_refine(views: Sequence[ViewState], settings: RemovalSettings, call: Call) -> ViewRefinement:
-    """Ask the painter that the settings name about as many painted views as refinement looks at."""
-    asked = [
-        ViewToRefine(v.id, v.painted, v.rules, v.best[1].image, v.best[1].target)
-        for v in views
-        if v.rules is not None and v.best is not None
-    ]
-    who = painter(settings.refine_views, call)
-    return refine_views(who, looked_at(asked, settings.refine), settings.random_seed, call)
-
-
-def with_answers(views: Sequence[ViewState], asked: ViewRefinement) -> tuple[ViewState, ...]:
-    """The views with the answers that were accepted."""
-    answers = {a.camera_id: a.image for a in asked.views if a.image is not None}
-
-    def answered(view: ViewState) -> ViewState:
-        image = answers.get(view.id)
-        if image is None or view.rules is None:
-            return view
-        rules = np.where((image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
-        return replace(view, painted=image, rules=rules)
-
-    return tuple(map(answered, views))
