@@ -19,22 +19,9 @@ from .stages.propagate import Reference
 from .stages.reference import choose_reference
 from .stages.refine import looked_at, observed, refine_gaussians
 from .stages.seed import seed_gaussians, settle_gaussians
+from .steps import references
 from .steps.behind import take_painted_colours
-from .steps.references import (
-    Completed,
-    Turn,
-    after_reference,
-    carried_over,
-    complete_view_depth,
-    emptied,
-    left_to_charts,
-    map_reference,
-    paint_chart,
-    paint_view,
-    paint_views,
-    snapped,
-    texels_to_fill,
-)
+from .steps.references import Completed, Turn
 from .steps.view_refinement import refine_views
 from .view_state import ViewState, open_pixels
 
@@ -60,7 +47,7 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
     touched = sum(int(v.masks.silhouette.sum()) for v in filling.views)
     if turns[0].chart is not None and turns[0].name and run.settings.depth_prior != "auto":
         run.warnings.append(f"--depth-prior {run.settings.depth_prior} is not used: the reference is a chart")
-    filling = replace(filling, views=emptied(filling.kept, filling.views))
+    filling = replace(filling, views=references.emptied(filling.kept, filling.views))
     for number, turn in enumerate(turns):
         if number and open_pixels(filling.views) < run.settings.extra_gain * hole:
             break
@@ -83,14 +70,14 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
 def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix: str) -> Completed | None:
     """One chart without its hole; None if no view needs it."""
     assert turn.chart is not None
-    chart = carried_over(chart, filling.done)
-    target, hole = texels_to_fill(chart, turn.chart, filling.views)
+    chart = references.carried_over(chart, filling.done)
+    target, hole = references.texels_to_fill(chart, turn.chart, filling.views)
     if not target.any():
         if turn.name:
             run.warnings.append(f"--reference {turn.name}: no view needs this chart, it is not used")
         return None
     name = f"appearance{suffix}"
-    appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
+    appearance = run(name, references.paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
     run.warnings += appearance.warnings
     return Completed(chart.camera, appearance.image, chart.depth, target, ~target & chart.known, (chart,))
 
@@ -98,23 +85,22 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
 def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
     """One view without the object, which the program chooses unless the user did; None if charts are filled for it."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
-    masks = [v.left for v in views]
-    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
+    choice = run(f"reference{suffix}", choose_reference, [v.left for v in views], turn.name, tried)
     run.references.append(choice)
-    if turn.name and left_to_charts(charts, turn, settings):
+    if turn.name and references.left_to_charts(charts, turn, settings):
         run.warnings.append(f"--reference {turn.name}: without a picture of it, its hole is filled on charts")
         return None
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix
     calls = run.call("--inpaint", name), run.call("--depth-prior", name)
-    completion = run(name, complete_view_depth, view, settings, turn.picture, first, *calls)
+    completion = run(name, references.complete_view_depth, view, settings, turn.picture, first, *calls)
     depth = np.where(view.left.target, completion.depth, view.left.depth_after).astype(np.float32)
     # Where drawn surfaces scatter about the charts by more than a z-test allows, the charts tell the depth.
     rough = any(c.scatter > SAME_DEPTH for c in charts)
     if rough and view.hits is not None:
-        depth = snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
+        depth = references.snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
     name = f"appearance{suffix}"
-    appearance = run(name, paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
+    appearance = run(name, references.paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
     run.warnings += appearance.warnings
     run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
     source = ~view.left.target & ~view.left.silhouette & (depth > 0)
@@ -130,17 +116,16 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     if len(seeds) == 0:
         raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
     sampled = settings.propagate.transfer == "sample"
-    field_ = run(f"mapping{suffix}", map_reference, completed, views, settings) if sampled else None
-    with_seeds = filled.extended(seeds)
-    name = f"propagate{suffix}"
-    painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
+    field_ = run(f"mapping{suffix}", references.map_reference, completed, views, settings) if sampled else None
+    inputs = completed, field_, views, filled.extended(seeds), settings, run.progress
+    painting = run(f"propagate{suffix}", references.paint_views, *inputs)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
     looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
     new = run(f"settle{suffix}", settle_gaussians, filled, seeds, camera, looks, of_seeds, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
-    views = after_reference(views, painting.views, completed, filled, new, len(added))
+    views = references.after_reference(views, painting.views, completed, filled, new, len(added))
     return replace(filling, views=views, added=added, done=(*filling.done, completed))
 
 

@@ -185,17 +185,17 @@ def test_painted_and_refined_views_reach_the_splats(tmp_path: Path, monkeypatch:
     refine = written(folder, "refine.py", body)
     before: dict[str, np.ndarray] = {}
     seen: dict[str, Any] = {}  # by ID, what the splats are fitted to
-    ask, fit = filling.ask_to_refine, filling.refine_gaussians
+    ask, fit = filling.refine_views, filling.refine_gaussians
 
-    def asked(views: Any, *rest: Any) -> Any:
+    def asked(who: Any, views: Any, *rest: Any) -> Any:
         before.update({v.id: v.painted.astype(int) for v in views})
-        return ask(views, *rest)
+        return ask(who, views, *rest)
 
     def fitted(kept: Any, added: Any, views: Any, *rest: Any) -> Any:
         seen.update({v.camera.id: v for v in views})
         return fit(kept, added, views, *rest)
 
-    monkeypatch.setattr(filling, "ask_to_refine", asked)
+    monkeypatch.setattr(filling, "refine_views", asked)
     monkeypatch.setattr(filling, "refine_gaussians", fitted)
     few = ("--set", "refine.steps=2", "--inpaint", paint, "--report", str(folder / "report"))
     assert remove(folder, *few, "--refine-views", refine) == 0

@@ -61,7 +61,7 @@ def depth_prior(
     {image} and writes such a file: {out}, a PNG, or {npy}.
     Raises BadInput if the provider is unknown or its file, model or program cannot be used.
     """
-    provider = _provider(spec, call)
+    provider = depth_provider(spec, call)
     if provider is None:
         return None
     look, kind = provider
@@ -71,16 +71,11 @@ def depth_prior(
     return DepthPrior(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32), kind)
 
 
-def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) -> None:
-    """Raise BadInput now if `depth_prior` would for reasons that do not depend on the view."""
-    _provider(spec, call)
-
-
 Look = Callable[[Callable[[], np.ndarray], int, int], np.ndarray]  # (picture, height, width) → [h, w] float32
 
 
-def _provider(spec: str, call: Call) -> tuple[Look, str] | None:
-    """Who looks, and what its numbers are."""
+def depth_provider(spec: str, call: Call) -> tuple[Look, str] | None:
+    """Who looks, and what its numbers are; raises what `depth_prior` would for reasons that are not the view's."""
     name, _, rest = spec.partition(":")
     if spec in ("auto", "harmonic", "planar"):
         return None

@@ -149,20 +149,16 @@ def complete_view_depth(
         there = view.hits.depth
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
-        words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(disparity_of(depth), depth, share, words, PriorFit())
+        return DepthCompletion(disparity_of(depth), depth, share, f"{share:.0%} of the hole lies on charts", PriorFit())
 
-    def without_object() -> np.ndarray:
-        if picture is not None:
-            return paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette).image
-        return inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=ask).image
+    def first_fill() -> np.ndarray:
+        return paint_view(replace(view, hits=None), (), replace(settings, variant=0), picture, ask).image
 
     spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
-    prior = depth_prior(spec, masks.camera.height, masks.camera.width, without_object, model)
+    prior = depth_prior(spec, masks.camera.height, masks.camera.width, first_fill, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
-    depth_settings = replace(settings.depth, surface=surface)
-    known = rim(masks) & ~masks.occluder
-    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, depth_settings)
+    known, continued = rim(masks) & ~masks.occluder, replace(settings.depth, surface=surface)
+    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, continued)
 
 
 def paint_view(
@@ -217,9 +213,7 @@ def paint_views(
 
 
 def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
-    """The view with the depth of its splats, the new ones among them; or with the charts', where its own is theirs or
-    none.
-    """
+    """The view with the depth of its splats, new ones too; or with the charts', where its own is theirs or none."""
     v = view.left
     before, after = v.depth_before, np.zeros_like(v.depth_before)
     if charts:
@@ -236,9 +230,7 @@ def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -
 
 
 def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarray:
-    """z [H, W], but a chart's [H, W] (0 = none) where both are the same surface, by a relative tolerance: splats'
-    depths are rough, photos place charts.
-    """
+    """z [H, W]; a chart's (0 = none) where they are within a share of it: splats' are rough, photos place charts."""
     return np.where((there > 0) & (np.abs(depth - there) < tolerance * there), there, depth)
 
 
@@ -253,7 +245,12 @@ def after_reference(
     """The views with what a reference painted, and what of them it left open."""
 
     def after(view: ViewState, part: PaintedView) -> ViewState:
-        part, touched = _with_own_picture(part, completed), touched_window(new, view.camera)
+        touched = touched_window(new, view.camera)
+        if view.id == completed.camera.id:  # it shows its completed picture, not a mapped one
+            h, w = part.rules.shape
+            own = slice(part.top, part.top + h), slice(part.left, part.left + w)
+            rules = np.where(completed.target[own], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+            part = replace(part, image=completed.image[own], rules=rules)
         rules = part.rule_map(*view.painted.shape[:2])
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, completed), (int(coloured.sum()), completed), key=lambda found: found[0])
@@ -265,16 +262,6 @@ def after_reference(
         return replace(view, painted=picture, rules=told, best=best, left=left)
 
     return tuple(parallel_map(lambda pair: after(*pair), zip(views, painted)))
-
-
-def _with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView:
-    """The painted view; the reference's own shows its completed picture, not a mapped one."""
-    if painted.camera_id != completed.camera.id:
-        return painted
-    h, w = painted.rules.shape
-    part = slice(painted.top, painted.top + h), slice(painted.left, painted.left + w)
-    rules = np.where(completed.target[part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    return replace(painted, image=completed.image[part], rules=rules)
 
 
 def redrawn(picture: np.ndarray, filled: Gaussians, view: ViewMasks, touched: Window) -> np.ndarray:
@@ -297,8 +284,7 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is
     in front, where a splat's soft edge has the depth of neither.
     """
-    new = np.zeros(len(filled), bool)
-    new[len(filled) - added :] = True
+    new = np.arange(len(filled)) >= len(filled) - added
     around = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
     scene = drawing(filled, view.camera, with_colour=False, pixels=touched | dilated(view.target, MARGIN))
     before, uncoloured = (view.depth_after, view.alpha_after), rules == Rule.UNREACHED

@@ -63,8 +63,8 @@ class ViewRefinement:
         """The views with the answers that were accepted."""
         found = {view.id: view for view in views}
         for answer in self.views:
-            if answer.image is not None:
-                view = found[answer.camera_id]
+            view = found[answer.camera_id]
+            if answer.image is not None and view.rules is not None:
                 rules = np.where((answer.image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
                 found[view.id] = replace(view, painted=answer.image, rules=rules)
         return tuple(found.values())
@@ -75,7 +75,7 @@ def refine_views(who: Painter, views: Sequence[ViewState], seed: int, call: Call
 
     Raises BadInput if the painter fails at the first view; later failures only refuse their view.
     """
-    asked = [(view, mask) for view in views if int((mask := ~np.isin(view.rules, KEPT)).sum()) >= LEAST]
+    asked = [(v, m) for v in views if v.rules is not None and (m := ~np.isin(v.rules, KEPT)).sum() >= LEAST]
     done: list[RefinedView] = []
     for k, (view, mask) in enumerate(asked):
         part = replace(call, progress=lambda stage, _, __, words="", k=k: call.progress(stage, k, len(asked), words))
@@ -92,18 +92,16 @@ def refine_views(who: Painter, views: Sequence[ViewState], seed: int, call: Call
 
 
 def refine_view(who: Painter, view: ViewState, mask: np.ndarray, seed: int, call: Call) -> RefinedView:
-    """One view where it is masked, beside the reference that painted most of it; BadInput if the painter fails, a
-    refused view if its answer does not agree.
-    """
+    """One view where it is masked [H, W] bool; BadInput if the painter fails, refused if its answer does not agree."""
     assert view.best is not None
     part, (_, reference) = window_round_hole(mask), view.best
     painted, mask = view.painted[part], mask[part]
     left = reference.image[window_round_hole(reference.target)]
     stitched, stitched_mask, beside = side_by_side(left, painted, mask)
     answer = resized(who.paint(stitched, stitched_mask, seed, call), stitched_mask.shape, who.answer)
-    h, w = mask.shape
     try:
-        pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
+        right = scaled(answer[:, beside:], *mask.shape[::-1])
+        pasted = paste_picture(painted, mask, right, f"the answer of {who.who}")
         if pasted.warnings:
             raise BadInput(pasted.warnings[0])
         inside = mask.astype(np.float32)[..., None]  # under a blur that looks at the mask alone

@@ -14,7 +14,7 @@ from stand_ins import depth_model
 
 from gimp3d.errors import BadInput
 from gimp3d.priors.calls import Call
-from gimp3d.priors.monodepth import DepthPrior, check_depth_prior, depth_prior, relative_disparity
+from gimp3d.priors.monodepth import DepthPrior, depth_prior, depth_provider, relative_disparity
 from gimp3d.priors.networks import IMAGENET_MEAN, IMAGENET_STD, read_onnx
 
 
@@ -215,9 +215,9 @@ def test_torchscript_models_that_cannot_look_are_refused(tmp_path):
     with pytest.raises(BadInput, match=r"--depth-prior torchscript: .* answers with 1×3, which is no depth picture"):
         prior_of(f"torchscript:{tmp_path}/m.pt", 30, 40, picture(30, 40))
     with pytest.raises(BadInput, match=r"cannot read .*gone\.pt"):
-        check_depth_prior(f"torchscript:{tmp_path}/gone.pt")
+        depth_provider(f"torchscript:{tmp_path}/gone.pt", Call("--depth-prior"))
     with pytest.raises(BadInput, match="0x5 is no size for a picture"):
-        check_depth_prior(f"torchscript:{tmp_path}/m.pt,0x5")
+        depth_provider(f"torchscript:{tmp_path}/m.pt,0x5", Call("--depth-prior"))
 
 
 # Commands
