@@ -97,7 +97,7 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
 
     def watched(stage: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
         if stage == "seed":
-            made["target"] = inputs[0].target
+            made["target"] = inputs[3]
         made[stage] = work(*inputs)
         return made[stage]
 

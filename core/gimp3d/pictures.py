@@ -19,10 +19,10 @@ from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
-from .stages.view_refinement import ViewRefinement
 from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed
+from .steps.view_refinement import ViewRefinement
 
 FEW = 3  # views that are shown of many
 SHOWN = 0.25  # blend weight of what the boxes cut off from which a pixel is marked

@@ -17,10 +17,10 @@ from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .presets import PRESETS, RemovalSettings
 from .priors.inpaint import check_provider, painter
-from .priors.monodepth import check_depth_prior
+from .priors.monodepth import depth_provider
 from .progress import Progress, silent
 from .raster import render_bytes
-from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels, unobserved
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels
 from .stages.charts import Chart
 from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks, find_masks
@@ -268,7 +268,7 @@ def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> 
     """
     run = Run(settings, silent, allow_network=allow_network)
     notices = [check_provider(settings.inpaint, run.call("--inpaint", "read"))]
-    check_depth_prior(settings.depth_prior, run.call("--depth-prior", "read"))
+    depth_provider(settings.depth_prior, run.call("--depth-prior", "read"))
     if settings.refine_views:
         if not settings.refine.steps:
             raise BadInput("--refine-views: this preset does no refinement that would use them; use balanced or best")

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..geometry import bounds, dilated
 from ..solvers.patchmatch import nearest_allowed
 from ..solvers.robust import CUT, ROUNDS
 
@@ -56,13 +57,10 @@ class Appearance:
 
 def window_round_hole(hole: np.ndarray) -> tuple[slice, slice]:
     """The hole's bounding box, larger by its own size on every side."""
-    spans = []
-    for axis in (1, 0):
-        there = np.flatnonzero(hole.any(axis))
-        low, high = int(there[0]), int(there[-1]) + 1
-        margin = max(LEAST_SURROUNDINGS, high - low)
-        spans.append(slice(max(0, low - margin), high + margin))
-    return spans[0], spans[1]
+    spans = bounds(hole)
+    margins = [max(LEAST_SURROUNDINGS, s.stop - s.start) for s in spans]
+    rows, cols = (slice(max(0, s.start - m), s.stop + m) for s, m in zip(spans, margins))
+    return rows, cols
 
 
 def interpolated(image: np.ndarray, hole: np.ndarray, method: int = cv2.INPAINT_TELEA) -> np.ndarray:
@@ -84,8 +82,7 @@ def paste_picture(
     Raises BadInput if it has another shape or shows something else.
     """
     picture = resized(picture, hole.shape, name)
-    size = 2 * HALO + 1
-    outside = cv2.dilate(hole.astype(np.uint8), np.ones((size, size), np.uint8)) == 0
+    outside = ~dilated(hole, HALO)
     if known is not None and (outside & known).mean() >= LEAST_COMPARED:
         outside &= known
     if outside.mean() < LEAST_COMPARED:

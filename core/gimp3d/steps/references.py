@@ -1,7 +1,7 @@
 """References without the object: which comes next, its depth and picture, and how it is carried into all views.
 
 A completed reference is tiled with Gaussians; views are painted with it, and the Gaussians take the colours that views
-were painted with. What no reference reaches stays open. A painter that the user named may refine painted views.
+were painted with. What no reference reaches stays open.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ..gaussians import Gaussians
 from ..geometry import SOLID, colours_at, dilated, disparity_of, sees, window_mask
 from ..presets import RemovalSettings
 from ..priors.calls import Call
-from ..priors.inpaint import PROVIDERS, inpaint_reference, painter
-from ..priors.monodepth import depth_prior, looks
+from ..priors.inpaint import PROVIDERS, inpaint_reference
+from ..priors.monodepth import depth_prior
 from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
@@ -33,9 +33,6 @@ from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.reference import rim
-from ..stages.refine import looked_at
-from ..stages.seed import seed_gaussians, settle_gaussians
-from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
@@ -67,10 +64,7 @@ def turns_of(
 ) -> list[Turn]:
     """In which order references are completed, as far as there is something left to fill.
 
-    Raises
-    ------
-    BadInput
-        If the chart that is named does not exist.
+    Raises BadInput if the chart that is named does not exist.
     """
     number, count = chart_number(reference), len(charts)
     if number is not None:
@@ -155,21 +149,16 @@ def complete_view_depth(
         there = view.hits.depth
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
-        words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(disparity_of(depth), depth, share, words, PriorFit())
-    looked_at = None
+        return DepthCompletion(disparity_of(depth), depth, share, f"{share:.0%} of the hole lies on charts", PriorFit())
+
+    def first_fill() -> np.ndarray:
+        return paint_view(replace(view, hits=None), (), replace(settings, variant=0), picture, ask).image
+
     spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
-    if looks(spec):
-        if picture is not None:
-            pasted = paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette)
-        else:
-            pasted = inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=ask)
-        looked_at = pasted.image
-    prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
+    prior = depth_prior(spec, masks.camera.height, masks.camera.width, first_fill, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
-    depth_settings = replace(settings.depth, surface=surface)
-    known = rim(masks) & ~masks.occluder
-    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, depth_settings)
+    known, continued = rim(masks) & ~masks.occluder, replace(settings.depth, surface=surface)
+    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, continued)
 
 
 def paint_view(
@@ -201,12 +190,6 @@ def emptied(kept: Gaussians, views: Sequence[ViewState]) -> tuple[ViewState, ...
     return tuple(parallel_map(empty, views))
 
 
-def seed_surface(completed: Completed, surfels: bool, settings: RemovalSettings) -> Gaussians:
-    """Gaussians that tile the completed surface."""
-    c = completed
-    return seed_gaussians(c.camera, c.image, c.depth, c.target, surfels, settings.seed, c.camera.split == CHART)
-
-
 def map_reference(completed: Completed, views: Sequence[ViewState], settings: RemovalSettings) -> MappingField:
     """Where each pixel of the reference's hole has its like, in what the views show: the paper's sampling asks."""
     c = completed
@@ -230,9 +213,7 @@ def paint_views(
 
 
 def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
-    """The view with the depth of its splats, the new ones among them; or with the charts', where its own is theirs or
-    none.
-    """
+    """The view with the depth of its splats, new ones too; or with the charts', where its own is theirs or none."""
     v = view.left
     before, after = v.depth_before, np.zeros_like(v.depth_before)
     if charts:
@@ -249,23 +230,8 @@ def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -
 
 
 def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarray:
-    """z [H, W], but a chart's [H, W] (0 = none) where both are the same surface, by a relative tolerance: splats'
-    depths are rough, photos place charts.
-    """
+    """z [H, W]; a chart's (0 = none) where they are within a share of it: splats' are rough, photos place charts."""
     return np.where((there > 0) & (np.abs(depth - there) < tolerance * there), there, depth)
-
-
-def settle_seeds(
-    completed: Completed,
-    seeds: Gaussians,
-    filled: Gaussians,  # the scene without the object and without the seeds
-    views: Sequence[ViewState],
-    painting: Propagation,
-    settings: RemovalSettings,
-) -> Gaussians:
-    """The seeds that are needed, in the colours of the painted views."""
-    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
-    return settle_gaussians(filled, seeds, completed.camera, looks, settings.seed)
 
 
 def after_reference(
@@ -279,7 +245,12 @@ def after_reference(
     """The views with what a reference painted, and what of them it left open."""
 
     def after(view: ViewState, part: PaintedView) -> ViewState:
-        part, touched = _with_own_picture(part, completed), touched_window(new, view.camera)
+        touched = touched_window(new, view.camera)
+        if view.id == completed.camera.id:  # it shows its completed picture, not a mapped one
+            h, w = part.rules.shape
+            own = slice(part.top, part.top + h), slice(part.left, part.left + w)
+            rules = np.where(completed.target[own], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+            part = replace(part, image=completed.image[own], rules=rules)
         rules = part.rule_map(*view.painted.shape[:2])
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, completed), (int(coloured.sum()), completed), key=lambda found: found[0])
@@ -291,16 +262,6 @@ def after_reference(
         return replace(view, painted=picture, rules=told, best=best, left=left)
 
     return tuple(parallel_map(lambda pair: after(*pair), zip(views, painted)))
-
-
-def _with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView:
-    """The painted view; the reference's own shows its completed picture, not a mapped one."""
-    if painted.camera_id != completed.camera.id:
-        return painted
-    h, w = painted.rules.shape
-    part = slice(painted.top, painted.top + h), slice(painted.left, painted.left + w)
-    rules = np.where(completed.target[part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    return replace(painted, image=completed.image[part], rules=rules)
 
 
 def redrawn(picture: np.ndarray, filled: Gaussians, view: ViewMasks, touched: Window) -> np.ndarray:
@@ -323,8 +284,7 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is
     in front, where a splat's soft edge has the depth of neither.
     """
-    new = np.zeros(len(filled), bool)
-    new[len(filled) - added :] = True
+    new = np.arange(len(filled)) >= len(filled) - added
     around = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
     scene = drawing(filled, view.camera, with_colour=False, pixels=touched | dilated(view.target, MARGIN))
     before, uncoloured = (view.depth_after, view.alpha_after), rules == Rule.UNREACHED
@@ -338,28 +298,3 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     joined &= at_edge | (depth < (1 + LAYER_STEP) * farthest)
     wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * MARGIN,) * 2, np.uint8)) > 0
     return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
-
-
-def ask_to_refine(views: Sequence[ViewState], settings: RemovalSettings, call: Call) -> ViewRefinement:
-    """Ask the painter that the settings name about as many painted views as refinement looks at."""
-    asked = [
-        ViewToRefine(v.id, v.painted, v.rules, v.best[1].image, v.best[1].target)
-        for v in views
-        if v.rules is not None and v.best is not None
-    ]
-    who = painter(settings.refine_views, call)
-    return refine_views(who, looked_at(asked, settings.refine), settings.random_seed, call)
-
-
-def with_answers(views: Sequence[ViewState], asked: ViewRefinement) -> tuple[ViewState, ...]:
-    """The views with the answers that were accepted."""
-    answers = {a.camera_id: a.image for a in asked.views if a.image is not None}
-
-    def answered(view: ViewState) -> ViewState:
-        image = answers.get(view.id)
-        if image is None or view.rules is None:
-            return view
-        rules = np.where((image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
-        return replace(view, painted=image, rules=rules)
-
-    return tuple(map(answered, views))
