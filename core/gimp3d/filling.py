@@ -136,7 +136,7 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
-    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
+    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, painting, settings, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
     views = after_reference(views, painting.views, completed, filled, new, len(added))

@@ -105,8 +105,8 @@ def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Pictu
     """Filled views: raw, blended, and by which rule."""
     before, shown = {v.id: v.painted for v in views}, []
     for p in spread(painting.views):
-        was, title = before[p.camera_id], f"Filled view {p.camera_id}"
-        shown.append(Picture("rules", title, p.pasted(was), (p.rule_map(*was.shape[:2]), p.pasted(was, p.raw))))
+        was, title = before[p.camera.id], f"Filled view {p.camera.id}"
+        shown.append(Picture("rules", title, p.pasted(was), (p.rule_map(), p.pasted(was, p.raw))))
     return shown
 
 

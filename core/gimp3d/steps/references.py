@@ -225,8 +225,7 @@ def paint_views(
 ) -> Propagation:
     """Every view with the completed reference in its hole."""
     loaders = [partial(_to_paint, v, completed.charts, with_seeds) for v in views]
-    sources = None if field is None else (field.rows, field.cols)
-    return propagate(completed, loaders, settings.propagate, progress, sources)
+    return propagate(completed, loaders, settings.propagate, progress, field)
 
 
 def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
@@ -259,13 +258,11 @@ def settle_seeds(
     completed: Completed,
     seeds: Gaussians,
     filled: Gaussians,  # the scene without the object and without the seeds
-    views: Sequence[ViewState],
     painting: Propagation,
     settings: RemovalSettings,
 ) -> Gaussians:
     """The seeds that are needed, in the colours of the painted views."""
-    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
-    return settle_gaussians(filled, seeds, completed.camera, looks, settings.seed)
+    return settle_gaussians(filled, seeds, completed.camera, painting.views, settings.seed)
 
 
 def after_reference(
@@ -280,7 +277,7 @@ def after_reference(
 
     def after(view: ViewState, part: PaintedView) -> ViewState:
         part, touched = _with_own_picture(part, completed), touched_window(new, view.camera)
-        rules = part.rule_map(*view.painted.shape[:2])
+        rules = part.rule_map()
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, completed), (int(coloured.sum()), completed), key=lambda found: found[0])
         told = rules if view.rules is None else np.where(coloured, rules, view.rules)
@@ -295,12 +292,10 @@ def after_reference(
 
 def _with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView:
     """The painted view; the reference's own shows its completed picture, not a mapped one."""
-    if painted.camera_id != completed.camera.id:
+    if painted.camera.id != completed.camera.id:
         return painted
-    h, w = painted.rules.shape
-    part = slice(painted.top, painted.top + h), slice(painted.left, painted.left + w)
-    rules = np.where(completed.target[part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    return replace(painted, image=completed.image[part], rules=rules)
+    rules = np.where(completed.target[painted.part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+    return replace(painted, image=completed.image[painted.part], rules=rules)
 
 
 def redrawn(picture: np.ndarray, filled: Gaussians, view: ViewMasks, touched: Window) -> np.ndarray:
