@@ -22,9 +22,9 @@ from .priors.monodepth import check_depth_prior
 from .progress import Progress, silent
 from .raster import render_bytes
 from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
-from .stages.masks import Masks, find_masks
-from .stages.verdict import Verdict, judge
-from .steps.behind import NOT_LIT, Relit
+from .stages.masks import find_masks
+from .stages.verdict import judge
+from .steps.behind import Relit
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
 from .view_state import ViewState, open_pixels
 
@@ -111,8 +111,8 @@ def look(
         settings = replace(settings, mode="paper")
     masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra_masks)
     run.warnings += masks.warnings
-    if masks.removed.any() and masks.left_out:
-        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    if masks.removed.any() and (left_out := len(cameras) - len(masks.views)):
+        run.warnings.append(f"{left_out} views do not frame the region or lie inside it: not used")
     return look_behind(run, scene, region, masks, photos, shadow_masks)
 
 
@@ -123,7 +123,7 @@ def _filled(
     settings, masks = run.settings, behind.masks
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
-        return _result(run, masks, NOT_LIT)
+        return _result(run, behind)
     to_paint = charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
     run.pictures += pictures.of_charts(to_paint)
@@ -146,37 +146,30 @@ def _filled(
         share = left / masks.hole_pixels
         run.warnings.append(f"{share:.0%} of the hole's pixels ({left}) are reached by no reference view and stay open")
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
-    verdict = _judge(run, views, behind, filling, by_picture)
-    completed = {r.camera.id: r.image for r in filling.done}
-    result = _result(
-        run,
-        masks,
-        behind.lit,
-        added=filling.added,
-        open_pixels=left,
-        painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
-        charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
-        verdict=verdict,
-        refined_views=filling.asked,
-    )
-    return _with_changed(result, behind)
-
-
-def _judge(run: Run, views: Sequence[View], behind: Behind, filling: Filling, by_picture: bool) -> Verdict | None:
-    """How good the result probably is; a reference whose picture was given is what it is held against."""
-    return run(
+    verdict = run(
         "verdict",
         judge,
         behind.before,
         filling.kept.extended(filling.added),
-        behind.masks.views,
+        masks.views,
         [v.left.target for v in filling.views],
         {v.id: v.bare for v in filling.views},
         {v.camera.id for v in views if v.is_photo},
         behind.charts,
         {v.id: v.hits for v in filling.views if v.hits is not None},
-        filling.done[0] if filling.done and by_picture else None,
+        filling.done[0] if filling.done and by_picture else None,  # its picture was given: it is held against that
         words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
+    )
+    completed = {r.camera.id: r.image for r in filling.done}
+    return _result(
+        run,
+        behind,
+        filling.added,
+        open_pixels=left,
+        painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
+        charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
+        verdict=verdict,
+        refined_views=filling.asked,
     )
 
 
@@ -207,21 +200,15 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     return dict(zip((v.id for v in filling.views), parallel_map(finished, range(len(filling.views)))))
 
 
-def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
-    """The result with the Gaussians that stay, but not as they were: they count as removed and added."""
-    changed = np.zeros(len(result.keep), bool)
-    changed[behind.changed] = True
-    changed &= result.keep  # some were taken away since
-    if not changed.any():
-        return result
-    added = behind.scene.take(changed).extended(result.added)
-    return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
-
-
-def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+    """What stays, but not as it was, counts as removed and added."""
+    masks, lit, keep = behind.masks, behind.lit, ~behind.masks.removed
+    changed = np.intersect1d(behind.changed, np.flatnonzero(keep))  # some were taken away since
+    lifted = int(keep[lit.rows].sum())
+    keep[changed] = False
     return RemovalResult(
-        keep=~masks.removed,
-        added=added,
+        keep=keep,
+        added=behind.scene.take(changed).extended(added) if len(changed) else added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
@@ -232,7 +219,8 @@ def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, 
         proposed=masks.proposed,
         shadow=lit.shadow,
         reflection=lit.reflection,
-        lifted=int((~masks.removed)[lit.rows].sum()),
+        lifted=lifted,
+        changed=len(changed),
         **more,
     )
 
