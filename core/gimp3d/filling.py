@@ -17,6 +17,7 @@ from .stages.charts import Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
 from .stages.refine import observed, refine_gaussians
+from .stages.seed import settle_gaussians
 from .steps.behind import take_painted_colours
 from .steps.references import (
     Completed,
@@ -32,7 +33,6 @@ from .steps.references import (
     paint_view,
     paint_views,
     seed_surface,
-    settle_seeds,
     snapped,
     texels_to_fill,
     with_answers,
@@ -136,7 +136,8 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
-    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, painting, settings, words=counted)
+    given = filled, seeds, completed.camera, painting.views, settings.seed
+    new = run(f"settle{suffix}", settle_gaussians, *given, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
     views = after_reference(views, painting.views, completed, filled, new, len(added))

@@ -132,7 +132,7 @@ def test_a_job_runs_alone_moves_and_resumes(
         monkeypatch.setattr(pipeline, stage, again)
     for stage in ("exposures_of", "find_surfaces", "find_light", "chart_surfaces"):
         monkeypatch.setattr(behind, stage, again)
-    for stage in ("paint_chart", "seed_surface", "paint_views", "settle_seeds", "refine_gaussians"):
+    for stage in ("paint_chart", "seed_surface", "paint_views", "settle_gaussians", "refine_gaussians"):
         monkeypatch.setattr(filling, stage, again)
     run("remove", "--job", moved, "--resume", "--progress", "none")
     assert (moved / "out.ply").read_bytes() == first

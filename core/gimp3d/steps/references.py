@@ -33,7 +33,7 @@ from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.reference import rim
 from ..stages.refine import looked_at
-from ..stages.seed import seed_gaussians, settle_gaussians
+from ..stages.seed import seed_gaussians
 from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
 from ..view_state import ViewState
 
@@ -252,17 +252,6 @@ def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarra
     depths are rough, photos place charts.
     """
     return np.where((there > 0) & (np.abs(depth - there) < tolerance * there), there, depth)
-
-
-def settle_seeds(
-    completed: Completed,
-    seeds: Gaussians,
-    filled: Gaussians,  # the scene without the object and without the seeds
-    painting: Propagation,
-    settings: RemovalSettings,
-) -> Gaussians:
-    """The seeds that are needed, in the colours of the painted views."""
-    return settle_gaussians(filled, seeds, completed.camera, painting.views, settings.seed)
 
 
 def after_reference(

@@ -106,16 +106,15 @@ def _painted(
     rules[painted] = Rule.REFERENCE if sample else Rule.OWN_PIXELS
     if sample:
         sample(view, warp, rules)
-    raw = warp.colours
-    if settings.blend == "rim":
+    raw, blended = warp.colours, base
+    if painted.any() and settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
-    else:
+    elif painted.any():
         blended = blend_band(base, raw, painted, photo, BAND * reach, depth)
     rules[evidence] = Rule.EVIDENCE
     hole_alone = bounds(near.target)
     unblended = to_bytes(np.where(painted[..., None], raw, base)[hole_alone])
-    shown, told = blended[hole_alone].copy(), rules[hole_alone].copy()
-    new_depth = near.depth_new[hole_alone].astype(np.float32)
+    shown, told, new_depth = (a[hole_alone].copy() for a in (blended, rules, depth))
     top, left = (s.start for s in bounds(view.target))
     return PaintedView(view.camera, top, left, shown, unblended, told, new_depth)
 
@@ -123,7 +122,7 @@ def _painted(
 def blend_band(
     base: np.ndarray,  # [H, W, 3] uint8, the view round the hole
     raw: np.ndarray,  # [H, W, 3] float32, the fill, in the hole and in the band
-    painted: np.ndarray,  # [H, W] bool, where the fill is to be seen
+    painted: np.ndarray,  # [H, W] bool, where the fill is to be seen; somewhere it is
     band: np.ndarray,  # [H, W] bool, photo round the hole that the fill must fit
     width: float,  # px over which the correction follows the photo; farther away it counts less
     depth: np.ndarray,  # [H, W] z of the new scene
@@ -137,8 +136,6 @@ def blend_band(
     distance. Depth seams stop the correction.
     """
     result = base.copy()
-    if not painted.any():
-        return result
     distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5)
     near = distance <= FAR * width
     whole = near & (painted | band | (depth > 0))  # the correction passes what lies between
@@ -168,8 +165,6 @@ def blend_rim(
     of the emptied scene. The rim counts only where no seam of `depth`, [H, W] z of the new scene, parts it from the
     fill. Parts without a rim keep their own colours.
     """
-    if not painted.any():
-        return base.copy()
     rim = (cv2.dilate(painted.astype(np.uint8), SQUARE) > 0) & ~painted & ~no_photo & (depth > 0)
     nearest_fill = cv2.dilate(np.where(painted & (depth > 0), depth, 0).astype(np.float32), SQUARE)
     rim &= np.abs(nearest_fill - depth) < SEAM * depth
