@@ -37,7 +37,7 @@ from .report import summary_of, write_charts, write_removal_report
 from .run import Run
 from .stages.charts import chart_number
 from .stages.masks import MaskSettings
-from .stages.propagate.blend import to_bytes
+from .stages.propagate import to_bytes
 from .steps.references import charts_to_paint
 
 PASSES = ("rgb", "alpha", "depth", "normal")

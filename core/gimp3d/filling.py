@@ -120,8 +120,8 @@ def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Fil
     painting = run(f"propagate{suffix}", references.paint_views, *inputs)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
-    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
-    new = run(f"settle{suffix}", settle_gaussians, filled, seeds, camera, looks, of_seeds, words=counted)
+    given = filled, seeds, completed.camera, painting.views, settings.seed
+    new = run(f"settle{suffix}", settle_gaussians, *given, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
     views = references.after_reference(views, painting.views, completed, filled, new, len(added))

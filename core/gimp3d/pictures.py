@@ -100,9 +100,9 @@ def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Pictu
     """Filled views: raw, blended, and by which rule."""
     before, shown = {v.id: v.painted for v in views}, []
     for p in spread(painting.views, FEW):
-        was = before[p.camera_id]
-        maps = p.pasted(was), p.rule_map(*was.shape[:2]), p.pasted(was, p.raw)
-        shown.append(Picture("rules", f"Filled view {p.camera_id}", partial(by_rule, *maps)))
+        was = before[p.camera.id]
+        maps = p.pasted(was), p.rule_map(), p.pasted(was, p.raw)
+        shown.append(Picture("rules", f"Filled view {p.camera.id}", partial(by_rule, *maps)))
     return shown
 
 

@@ -145,8 +145,8 @@ def look(
         settings = replace(settings, mode="paper")
     masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra_masks)
     run.warnings += masks.warnings
-    if masks.removed.any() and masks.left_out:
-        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    if masks.removed.any() and (left_out := len(cameras) - len(masks.views)):
+        run.warnings.append(f"{left_out} views do not frame the region or lie inside it: not used")
     return look_behind(run, scene, region, masks, photos, shadow_masks)
 
 
@@ -241,7 +241,7 @@ def _filled(
     return _result(
         run,
         behind,
-        added=filling.added,
+        filling.added,
         open_pixels=left,
         painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
         charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
@@ -290,13 +290,13 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
 
 def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: Any) -> RemovalResult:
     """What stays, but not as it was, counts as removed and added."""
-    masks, stays = behind.masks, ~behind.masks.removed
-    changed = np.zeros(len(stays), bool)
-    changed[behind.changed] = True
-    changed &= stays  # some were taken away since
+    masks, lit, keep = behind.masks, behind.lit, ~behind.masks.removed
+    changed = np.intersect1d(behind.changed, np.flatnonzero(keep))  # some were taken away since
+    lifted = int(keep[lit.rows].sum())
+    keep[changed] = False
     return RemovalResult(
-        keep=stays & ~changed,
-        added=behind.scene.take(changed).extended(added) if changed.any() else added,
+        keep=keep,
+        added=behind.scene.take(changed).extended(added) if len(changed) else added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
@@ -305,10 +305,10 @@ def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: An
         warnings=tuple(run.warnings),
         selection=masks.selection.counts,
         proposed=masks.proposed,
-        shadow=behind.lit.shadow,
-        reflection=behind.lit.reflection,
-        lifted=int(stays[behind.lit.rows].sum()),
-        changed=int(changed.sum()),
+        shadow=lit.shadow,
+        reflection=lit.reflection,
+        lifted=lifted,
+        changed=len(changed),
         **more,
     )
 

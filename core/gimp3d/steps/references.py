@@ -208,8 +208,7 @@ def paint_views(
 ) -> Propagation:
     """Every view with the completed reference in its hole."""
     loaders = [partial(_to_paint, v, completed.charts, with_seeds) for v in views]
-    sources = None if field is None else (field.rows, field.cols)
-    return propagate(completed, loaders, settings.propagate, progress, sources)
+    return propagate(completed, loaders, settings.propagate, progress, field)
 
 
 def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
@@ -247,11 +246,9 @@ def after_reference(
     def after(view: ViewState, part: PaintedView) -> ViewState:
         touched = touched_window(new, view.camera)
         if view.id == completed.camera.id:  # it shows its completed picture, not a mapped one
-            h, w = part.rules.shape
-            own = slice(part.top, part.top + h), slice(part.left, part.left + w)
-            rules = np.where(completed.target[own], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-            part = replace(part, image=completed.image[own], rules=rules)
-        rules = part.rule_map(*view.painted.shape[:2])
+            rules = np.where(completed.target[part.part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+            part = replace(part, image=completed.image[part.part], rules=rules)
+        rules = part.rule_map()
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, completed), (int(coloured.sum()), completed), key=lambda found: found[0])
         told = rules if view.rules is None else np.where(coloured, rules, view.rules)

@@ -215,7 +215,7 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     ring = (np.abs(plain.scene.means[:, :2]).max(1) < OFF) & (plain.scene.means[:, 2] < 0.01)
     whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
     taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
-    masks = Masks(Selection(taken), tuple(plain.views), (), "need", 1.0, "")
+    masks = Masks(Selection(taken), tuple(plain.views), "need", 1.0, "")
     photos = [render_bytes(whole, v.camera) for v in plain.views]
     levelled = Exposure(np.ones(3))
     views = [ViewState.first(v, photo, levelled) for v, photo in zip(plain.views, photos)]
