@@ -201,8 +201,8 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     """ID → the view's photo, at its own exposure, with what the removal changed of it."""
 
     def finished(number: int) -> np.ndarray:
-        v = filling.views[number]
-        return v.exposure.back(v.painted, v.photo, v.masks.silhouette | v.masks.target | lit.shaded(number))
+        v, shaded = filling.views[number], lit.lifted.shaded[number] if lit.lifted else False
+        return v.exposure.back(v.painted, v.photo, v.masks.silhouette | v.masks.target | shaded)
 
     return dict(zip((v.id for v in filling.views), parallel_map(finished, range(len(filling.views)))))
 
@@ -230,9 +230,8 @@ def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, 
         warnings=tuple(run.warnings),
         selection=masks.selection.counts,
         proposed=masks.proposed,
-        shadow=lit.shadow,
-        reflection=lit.reflection,
         lifted=int((~masks.removed)[lit.rows].sum()),
+        **lit.facts(),
         **more,
     )
 

@@ -140,10 +140,7 @@ def judge(
         chart, off = np.zeros((2, *near.shape), np.float32)
         met = (hits or {}).get(view.camera.id)
         if met is not None:
-            chart = met.depth
-            for number, height in enumerate(unsure):
-                on = (met.depth > 0) & (met.chart == number)
-                off[on] = height[met.rows[on], met.cols[on]]
+            chart, off = met.depth, met.of(unsure)
         return _Look(view, photo, ring, before, after, depth, chart, off, haze, error)
 
     looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
@@ -209,7 +206,8 @@ def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
 
 
 def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.ndarray) -> Witness:
-    return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
+    no = np.zeros_like(hidden)
+    return Witness(camera, picture, hidden, no, no, depth)
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
