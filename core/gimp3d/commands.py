@@ -204,7 +204,7 @@ def write_masks(
     seen = {v.id: v for v in behind.views}
     if pictures:
         write_json(pictures / "proposed.json", frame.proposed_back(behind.masks.proposed))
-        write_json(pictures / "light.json", {"shadow": behind.lit.shadow, "reflection": behind.lit.reflection})
+        write_json(pictures / "light.json", behind.lit.facts())
         if all(c.split == "train" for c in written):
             charts = charts_to_paint(behind.charts, behind.views)
             write_charts(pictures / "charts", frame.charts_back(charts))

@@ -158,4 +158,4 @@ def recolour(run: Run, filling: Filling) -> Filling:
     if filling.added is None or run.settings.charts is None or not run.settings.refine.steps:
         return filling
     found = run("recolour", take_painted_colours, filling.kept, filling.added, filling.views)
-    return replace(filling, kept=found.scene(filling.kept), recoloured=found.rows)
+    return replace(filling, kept=filling.kept.with_rows(found.rows, found.gaussians), recoloured=found.rows)

@@ -75,6 +75,13 @@ class Gaussians:
         """The Gaussians at `rows` (indices or a boolean mask), in that order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in ARRAYS})
 
+    def with_rows(self, rows: np.ndarray, others: Gaussians) -> Gaussians:
+        """These Gaussians with others in the place of those at `rows`."""
+        arrays = {name: getattr(self, name).copy() for name in ARRAYS}
+        for name, array in arrays.items():
+            array[rows] = getattr(others, name)
+        return replace(self, **arrays)
+
     def extended(self, other: Gaussians | None) -> Gaussians:
         """These Gaussians followed by others of the same kind, if any; the lower SH degree is padded with zeros."""
         if other is None:

@@ -70,7 +70,7 @@ def of_light(lit: Relit, camera_ids: Sequence[str], shown: Sequence[str] | None 
     order = sorted(range(len(camera_ids)), key=lambda k: -int(lifted.shaded[k].sum()))[:2]
     if shown is not None:
         order = [k for k, name in enumerate(camera_ids) if name in shown]
-    what = [name for name, facts in (("shadow", lit.shadow), ("reflection", lit.reflection)) if facts["found"]]
+    what = [name for name, facts in lit.facts().items() if facts["found"]]
     title = f"The object's {' and '.join(what)} in {{}}: photo, what is left alone, undone"
     parts = {k: [lifted.before[k], np.dstack([lifted.light[k]] * 3), lifted.photos[k]] for k in order}
     changed = [k for k in order if lifted.shaded[k].any()]

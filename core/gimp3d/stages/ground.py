@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..geometry import dilated
 from .charts import shown_there, usual_spread
 from .charts.find import flat_surface, lay_surface, pixel_size, surface_beside
 from .charts.plane import Facing, Plane, extent, largest_plane
-from .masks import ViewMasks
 from .mosaic import mosaic
 from .witness import Says, Textures, Witness, ask
 
@@ -33,25 +32,21 @@ VIEWED = 1.25  # times the usual spread of photos beyond which they show somethi
 Ground = Facing  # what photos show of a surface round the object, coarsely
 
 
-def look_at(
-    planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
-) -> list[Ground]:
+def look_at(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Ground]:
     """What photos show of the surfaces round the object, where they show enough, and of walls beside it."""
-    planes = (*planes, *_walls(planes, views, witnesses, region))
-    looked = (_look_at(plane, planes, views, witnesses, region) for plane in planes)
+    planes = (*planes, *_walls(planes, witnesses, region))
+    looked = (_look_at(plane, planes, witnesses, region) for plane in planes)
     return [ground for ground in looked if ground.known.sum() >= FEWEST]
 
 
-def _walls(
-    planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
-) -> list[Plane]:
+def _walls(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Plane]:
     """Planes beside the object, which it hides nowhere, that hold most of what stands round it."""
     diagonal = extent(region)
-    points = surface_beside(views, witnesses, WALL_POINTS).points
+    points = surface_beside(witnesses, WALL_POINTS).points
     points = points[(np.abs(points - planes[0].origin) < REACH * diagonal).all(1)]
     for plane in planes:
         points = points[plane.local(points)[:, 2] > WALL_INLIER * diagonal]
-    cameras, rng = np.array([v.camera.centre for v in views]), np.random.default_rng(0)
+    cameras, rng = np.array([w.camera.centre for w in witnesses]), np.random.default_rng(0)
     found: list[Plane] = []
     least = WALL_SHARE * len(points)
     while candidate := largest_plane(points, np.ones(len(points)), WALL_INLIER * diagonal, cameras, region, rng):
@@ -64,16 +59,14 @@ def _walls(
     return found
 
 
-def _look_at(
-    plane: Plane, planes: Sequence[Plane], views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region
-) -> Ground:
+def _look_at(plane: Plane, planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> Ground:
     diagonal = extent(region)
     texel = diagonal / DENSITY
     flat = flat_surface(plane, plane.origin, np.full(2, 2 * REACH * diagonal), texel)
-    beside = max(BESIDE, math.ceil(BLURRED * pixel_size(plane.origin, plane.normal, views) / texel))
-    views, witnesses = zip(*parallel_map(lambda p: _shrunk(*p, plane.origin, texel), list(zip(views, witnesses))))
+    beside = max(BESIDE, math.ceil(BLURRED * pixel_size(plane.origin, plane.normal, witnesses) / texel))
+    witnesses = parallel_map(lambda w: _shrunk(w, plane.origin, texel), witnesses)
     textures = Textures.make(witnesses)
-    surface = lay_surface(flat, region, views, witnesses, textures, enough=ENOUGH)
+    surface = lay_surface(flat, region, witnesses, textures, enough=ENOUGH)
     points = surface.points()
     said = ask(witnesses, points.reshape(-1, 3), ROUGH).reshape(-1, *flat.depth.shape)
     image, spread, _ = mosaic(points, plane.normal, witnesses, said)
@@ -88,13 +81,13 @@ def _look_at(
     return Ground(plane, flat.camera, surface.depth, there, image, known & ~hole, hole)
 
 
-def _shrunk(view: ViewMasks, witness: Witness, place: np.ndarray, texel: float) -> tuple[ViewMasks, Witness]:
+def _shrunk(witness: Witness, place: np.ndarray, texel: float) -> Witness:
     """The view at about a texel's resolution at a place; colours are those beside the object."""
-    camera = view.camera
+    camera = witness.camera
     z = float(camera.project(place[None])[1][0])
     factor = min(int(0.5 * texel * camera.fx / z) if z > 0 else 1, camera.width // 2, camera.height // 2)
     if factor < 2:
-        return view, witness
+        return witness
     h, w = camera.height // factor, camera.width // factor
     lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
     small = replace(camera, width=w, height=h, **lens)
@@ -103,11 +96,10 @@ def _shrunk(view: ViewMasks, witness: Witness, place: np.ndarray, texel: float) 
     def blocks(values: np.ndarray) -> np.ndarray:
         return values[: h * factor, : w * factor].reshape(h, factor, w, factor, *values.shape[2:])
 
-    hidden, beside, depth = (np.ascontiguousarray(m[middle]) for m in (witness.hidden, witness.beside, witness.depth))
+    maps = (witness.hidden, witness.beside, witness.veiled, witness.depth)
     shown = ~(witness.hidden | witness.beside)
     count = blocks(shown).sum((1, 3))
     total = blocks(np.where(shown[..., None], witness.photo, 0)).sum((1, 3), dtype=np.int32)
     mean = (total / np.maximum(count, 1)[..., None]).astype(np.uint8)
     photo = np.where(count[..., None] > 0, mean, witness.photo[middle])
-    maps = {f.name: getattr(view, f.name)[middle] for f in fields(view) if f.name != "camera"}
-    return replace(view, camera=small, **maps), Witness(small, photo, hidden, beside, depth)
+    return Witness(small, photo, *(np.ascontiguousarray(m[middle]) for m in maps))

@@ -45,7 +45,8 @@ def source_visibility(
 
     def shown(view: tuple[Camera, np.ndarray, np.ndarray]) -> np.ndarray:
         other, z, hidden = view
-        witness = Witness(other, np.empty((0, 0, 3), np.uint8), hidden, np.zeros_like(hidden), z)
+        no = np.zeros_like(hidden)
+        witness = Witness(other, np.empty((0, 0, 3), np.uint8), hidden, no, no, z)
         return ask([witness], points, SAME_DEPTH)[0] == Says.SEEN
 
     share = np.zeros(depth.shape, np.float32)

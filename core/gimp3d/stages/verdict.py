@@ -134,10 +134,7 @@ def judge(
         depth, haze = weights.surface_depth()[0], weights.footprint(floats)
         chart, off = np.zeros((2, *near.shape), np.float32)
         if met := hits.get(view.camera.id):
-            chart = met.depth
-            for number, height in enumerate(unsure):
-                on = (met.depth > 0) & (met.chart == number)
-                off[on] = height[met.rows[on], met.cols[on]]
+            chart, off = met.depth, met.of(unsure)
         return _Look(view, photo, ring, before, after, depth, chart, off, haze, error)
 
     looks = parallel_map(look, spread(showing, VIEWS))
@@ -202,7 +199,8 @@ def _alike(looks: Sequence[_Look], parts: Sequence[_Sample], sample: _Sample) ->
 
 
 def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.ndarray) -> Witness:
-    return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
+    no = np.zeros_like(hidden)
+    return Witness(camera, picture, hidden, no, no, depth)
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -35,9 +35,6 @@ class Says(IntEnum):
     BESIDE = 5  # it lies on the surface shown, but right beside the object: the pixel may show both
 
 
-NOTHING, SEEN, HIDDEN, BEHIND, THROUGH, BESIDE = 0, 1, 2, 3, 4, 5  # the same, for the kernels
-
-
 @dataclass(frozen=True)
 class Witness:
     """A view as evidence."""
@@ -46,11 +43,17 @@ class Witness:
     photo: np.ndarray  # [H, W, 3] uint8
     hidden: np.ndarray  # [H, W] bool, where the photo shows the object
     beside: np.ndarray  # [H, W] bool, where it may show some of it
+    veiled: np.ndarray  # [H, W] bool, where the scene draws no solid surface, or what stands before the object
     depth: np.ndarray  # [H, W] float32 z of the scene with the object, 0 = nothing
 
     def cropped(self, window: Window) -> Witness:
-        maps = (np.ascontiguousarray(a[window]) for a in (self.photo, self.hidden, self.beside, self.depth))
-        return Witness(cropped(self.camera, window), *maps)
+        maps = (self.photo, self.hidden, self.beside, self.veiled, self.depth)
+        return Witness(cropped(self.camera, window), *(np.ascontiguousarray(m[window]) for m in maps))
+
+    @property
+    def depth_beside(self) -> np.ndarray:
+        """[H, W] z of the solid surfaces beside the object; 0 elsewhere."""
+        return np.where(self.hidden | self.veiled, 0, self.depth)
 
 
 def ask(witnesses: Sequence[Witness], points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -93,13 +96,13 @@ def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
         row, col = int(v), int(u)
         front = depth[row, col]
         if hidden[row, col]:
-            said[i] = HIDDEN
+            said[i] = Says.HIDDEN
         elif 0 < front < (1 - tolerance) * z:
-            said[i] = BEHIND
+            said[i] = Says.BEHIND
         elif front > (1 + tolerance) * z or front == 0:
-            said[i] = THROUGH
+            said[i] = Says.THROUGH
         else:
-            said[i] = BESIDE if beside[row, col] else SEEN
+            said[i] = Says.BESIDE if beside[row, col] else Says.SEEN
 
 
 def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -149,14 +152,10 @@ class Textures:
         Σ n m² / Σ t² over points that at least three photos show, t a photo's value there, m their mean. It is
         greatest where the points lie on the real surface (plane sweep: Collins 1996).
         """
-        common, total = self.energy(points).sum(0)
-        return float(common / total) if total > 0 else 0.0
-
-    def energy(self, points: np.ndarray) -> np.ndarray:
-        """[N, 2]: what the photos have in common at each point, n m², and all they show there, Σ t²."""
         energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
         run_ranges(_compare_range, len(points), points, self.cameras, self.starts, self.values, AGREEING, energy)
-        return energy
+        common, total = energy.sum(0)
+        return float(common / total) if total > 0 else 0.0
 
 
 @exact_kernel  # points may be NaN

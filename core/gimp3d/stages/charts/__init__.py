@@ -18,7 +18,6 @@ from ...box import Region, in_region
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
 from ...solvers.kriging import carried
-from ..masks import ViewMasks
 from ..mosaic import mosaic
 from ..witness import Says, Textures, Witness, ask
 from .find import CHART as CHART
@@ -65,16 +64,12 @@ def chart_number(reference: str | None) -> int | None:
 
 
 def lay_planes(
-    planes: Sequence[Plane],
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],  # of the same views
-    region: Region,
-    settings: ChartSettings = ChartSettings(),
+    planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, settings: ChartSettings = ChartSettings()
 ) -> tuple[Laid, ...]:
     """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
     textures = Textures.make(witnesses)
-    flats = [_placed(plane, region, views, witnesses, settings.largest) for plane in planes]
-    laid = [lay_surface(flat, region, views, witnesses, textures, settings) for flat in flats if flat is not None]
+    flats = [_placed(plane, region, witnesses, settings.largest) for plane in planes]
+    laid = [lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None]
     return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
 
 
@@ -140,9 +135,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
     )
 
 
-def _placed(
-    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], largest: float
-) -> Surface | None:
+def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float) -> Surface | None:
     """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
 
     None if the object hides nothing of it, or no view faces what it hides.
@@ -159,7 +152,7 @@ def _placed(
     size = high - low
     size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
     place = plane.points(*((low + high) / 2)[:, None])[0]
-    texel = pixel_size(place, plane.normal, views)
+    texel = pixel_size(place, plane.normal, witnesses)
     return flat_surface(plane, place, size, max(texel, float(size.max()) / largest)) if texel < math.inf else None
 
 
