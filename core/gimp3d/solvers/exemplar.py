@@ -18,7 +18,7 @@ from ..compute.threads import run_ranges
 from ..geometry import bounds, dilated
 from .edges import Edge, find_edges, guide_of
 from .kriging import Expected, expect
-from .patches import index_patches, lay_out, repainting
+from .patches import index_patches, lay_out
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
 from .poisson import solve_poisson
 from .regularity import continue_regularly, find_motions
@@ -144,8 +144,7 @@ def _filled(
     coarser level votes first: averaging what it copies is sharper than enlarging the coarser colours.
     """
     hole, allowed, radius = level.hole, level.allowed, level.radius
-    patches = lay_out(np.ascontiguousarray(level.channels[..., :3]), radius)
-    guides, repaint, index = level.channels[..., 3:].copy(), repainting(patches, hole), None
+    shown, index = level.channels.copy(), None
     doubt = float(np.median(level.expected.variance[hole]))
     away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
     penalty = np.float32(LOCALITY / hole.shape[1]) * away
@@ -154,7 +153,7 @@ def _filled(
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
         colours = level.channels[rows[hole], cols[hole]]
         field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
-        index = index_patches(patches, allowed, TREE_GRID)
+        index = index_patches(lay_out(shown[..., :3].copy(), radius), allowed, TREE_GRID)
     else:
         rounds, usual = 1, float(np.median(coarser.cost[coarser.found]))
         field = upsampled(coarser, level.touching, allowed)
@@ -164,10 +163,10 @@ def _filled(
         field: NearestNeighbourField, colours: np.ndarray, number: int
     ) -> tuple[NearestNeighbourField, np.ndarray]:
         nonlocal usual
-        repaint(colours[:, :3])
-        guides[hole] = colours[:, 3:]
+        shown[hole] = colours
+        patches = lay_out(shown[..., :3].copy(), radius)
         heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
-        guided = np.dstack([guides, level.edges, heed * level.expected.colours])
+        guided = np.dstack([shown[..., 3:], level.edges, heed * level.expected.colours])
         matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
         field = refined(field, patches, level.touching, allowed, matching, penalty, index, guided, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))

@@ -8,7 +8,6 @@ guesses in place of the tree, fields as near to the exact ones took 1.8–2 time
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -17,13 +16,12 @@ from numba import float32
 
 from ..compute.jit import inline_kernel, kernel
 from ..compute.simd import LANES, fma16, load1, load16, splat16, store16
-from ..compute.threads import parallel_map, run_ranges
+from ..compute.threads import run_ranges
 
 SAMPLES = 4096  # patches that the main components are found from
 BOUND = 0.9999  # by which coordinates are shortened: rounding must not lift their distance above the patches'
 NOWHERE = 1e18  # coordinate of the last block's empty places
 SPREAD_SAMPLES = 256  # patches by which a node finds the component that spreads most
-SUBTREES = 16  # pieces of work
 
 
 class Patches(NamedTuple):
@@ -49,23 +47,6 @@ def lay_out(channels: np.ndarray, radius: int) -> Patches:
     values = np.zeros(bordered.size + len(weights), np.float32)  # the last row's vectors may reach beyond it
     values[: bordered.size] = bordered.ravel()
     return Patches(values, bordered.shape[1] * count, count, radius, weights)
-
-
-def repainting(patches: Patches, changing: np.ndarray) -> Callable[[np.ndarray], None]:
-    """What puts new colours [N, C] of the pixels `changing` ([H, W] bool), in the order of np.nonzero, into `values`.
-
-    Laying a large picture out anew for a small hole is slow.
-    """
-    numbers, r = np.full(changing.shape, -1, np.int32), patches.radius
-    numbers[changing] = np.arange(changing.sum())
-    bordered = cv2.copyMakeBorder(numbers, r, r, r, r, cv2.BORDER_REFLECT_101).ravel()
-    places = np.flatnonzero(bordered >= 0)  # at the border, a pixel lies there more than once
-    pixels, numbers = patches.values[: bordered.size * patches.channels].reshape(bordered.size, -1), bordered[places]
-
-    def repaint(colours: np.ndarray) -> None:
-        pixels[places] = colours[numbers]
-
-    return repaint
 
 
 class Components(NamedTuple):
@@ -147,11 +128,10 @@ def index_patches(patches: Patches, allowed: np.ndarray, step: int) -> tuple[Com
     count = -(-len(rows) // LANES)
     order = np.arange(len(rows), dtype=np.int32)
     split_component, split_value = np.zeros(count, np.int32), np.zeros(count, np.float32)
-    growing, nodes = (found, order, split_component, split_value), [(0, count)]
-    while len(nodes) < min(SUBTREES, count):  # nodes of one depth differ in size by one block at most
-        parallel_map(lambda node: _split(*node, *growing), nodes)
-        nodes = [half for lo, hi in nodes for half in ((lo, (lo + hi) // 2), ((lo + hi) // 2, hi)) if half[1] > half[0]]
-    parallel_map(lambda node: _grow(*node, *growing), nodes)
+    ends = np.array([0, count])  # of the nodes of one depth
+    while (np.diff(ends) > 1).any():
+        run_ranges(_split, len(ends) - 1, ends, found, order, split_component, split_value)
+        ends = np.unique(np.concatenate([ends, (ends[:-1] + ends[1:]) // 2]))
     features = np.full((count * LANES, LANES), NOWHERE, np.float32)
     features[: len(order)] = found[order]
     features = np.ascontiguousarray(features.reshape(count, LANES, LANES).transpose(0, 2, 1)).ravel()
@@ -176,55 +156,44 @@ def leaf_of(wanted, at, split_component, split_value):
 
 
 @kernel
-def _grow(lo, hi, found, order, split_component, split_value):
-    """The tree below the node [lo, hi)."""
-    stack = [(lo, hi)]
-    while len(stack) > 0:
-        lo, hi = stack.pop()
-        if hi - lo > 1:
-            _split(lo, hi, found, order, split_component, split_value)
-            stack.append((lo, (lo + hi) // 2))
-            stack.append(((lo + hi) // 2, hi))
-
-
-@kernel
-def _split(lo, hi, found, order, split_component, split_value):
-    """Part the patches of the node [lo, hi) into two halves along the component where they spread most."""
-    if hi - lo < 2:
-        return
-    first, end, middle = lo * 16, min(hi * 16, len(order)), (lo + hi) // 2
-    step = max(1, (end - first) // SPREAD_SAMPLES)
-    widest, component = -1.0, 0
-    for c in range(found.shape[1]):
-        total, squares, count = 0.0, 0.0, 0
-        for i in range(first, end, step):
-            value = float(found[order[i], c])
-            total += value
-            squares += value * value
-            count += 1
-        spread = squares - total * total / count
-        if spread > widest:
-            widest, component = spread, c
-    keys = np.empty(end - first, np.float32)
-    for i in range(first, end):
-        keys[i - first] = found[order[i], component]
-    cut, left, right = middle * 16 - first, 0, end - first - 1
-    while left < right:  # Hoare's quickselect: keys left of `cut` are not larger than those from it on
-        pivot, i, j = keys[(left + right) // 2], left, right
-        while i <= j:
-            while keys[i] < pivot:
-                i += 1
-            while keys[j] > pivot:
-                j -= 1
-            if i <= j:
-                keys[i], keys[j] = keys[j], keys[i]
-                order[first + i], order[first + j] = order[first + j], order[first + i]
-                i += 1
-                j -= 1
-        if cut <= j:
-            right = j
-        elif cut >= i:
-            left = i
-        else:
-            break
-    split_component[middle], split_value[middle] = component, keys[cut]
+def _split(lo, hi, ends, found, order, split_component, split_value):
+    """Part the patches of each node [ends[k], ends[k + 1]) into two halves along the component where they spread most."""
+    for k in range(lo, hi):
+        if ends[k + 1] - ends[k] < 2:
+            continue
+        first, end, middle = ends[k] * 16, min(ends[k + 1] * 16, len(order)), (ends[k] + ends[k + 1]) // 2
+        step = max(1, (end - first) // SPREAD_SAMPLES)
+        widest, component = -1.0, 0
+        for c in range(found.shape[1]):
+            total, squares, count = 0.0, 0.0, 0
+            for i in range(first, end, step):
+                value = float(found[order[i], c])
+                total += value
+                squares += value * value
+                count += 1
+            spread = squares - total * total / count
+            if spread > widest:
+                widest, component = spread, c
+        keys = np.empty(end - first, np.float32)
+        for i in range(first, end):
+            keys[i - first] = found[order[i], component]
+        cut, left, right = middle * 16 - first, 0, end - first - 1
+        while left < right:  # Hoare's quickselect: keys left of `cut` are not larger than those from it on
+            pivot, i, j = keys[(left + right) // 2], left, right
+            while i <= j:
+                while keys[i] < pivot:
+                    i += 1
+                while keys[j] > pivot:
+                    j -= 1
+                if i <= j:
+                    keys[i], keys[j] = keys[j], keys[i]
+                    order[first + i], order[first + j] = order[first + j], order[first + i]
+                    i += 1
+                    j -= 1
+            if cut <= j:
+                right = j
+            elif cut >= i:
+                left = i
+            else:
+                break
+        split_component[middle], split_value[middle] = component, keys[cut]
