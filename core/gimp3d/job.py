@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -141,15 +140,14 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
 
 def _refuse_reaching_out(job: RemovalJob, folder: Path, given: Mapping[str, Any], own: bool) -> None:
     """Raise BadInput if a job names what it did not bring, and neither did the user, nor wrote it so themselves."""
-    path, root = folder / "job.json", folder.resolve()
+    root = folder.resolve()
     written = {"stages", "summary.json", *(getattr(job, n) for n in WRITTEN if n not in given)}
-    for link in _links_out(folder, root):
-        place = link.relative_to(folder)
-        if not own or any(place.is_relative_to(w) for w in written if w):
+    for link in (p for p in folder.rglob("*") if p.is_symlink() and not _lies_in(root, p)):  # links are not followed
+        if not own or any(link.relative_to(folder).is_relative_to(w) for w in written if w):
             raise BadInput(f"job: {link} is a link that leads out of the folder; take it away")
     if own:
         return
-    stranger = f"job: {path} was not written by you on this machine, and"
+    stranger = f"job: {folder / 'job.json'} was not written by you on this machine, and"
     for name in job.PATHS:
         value, option = getattr(job, name), "SCENE" if name == "scene" else f"--{name.replace('_', '-')}"
         if name not in given and value not in (None, "none") and not _lies_in(root, folder / value):
@@ -167,14 +165,6 @@ def _named_providers(job: RemovalJob, given: Mapping[str, Any]) -> Iterator[tupl
             yield name, getattr(job, name) or ""
         if "set" not in given:
             yield name, job.set.get(name, "")
-
-
-def _links_out(folder: Path, root: Path) -> Iterator[Path]:
-    for place, folders, files in os.walk(folder):  # links are not followed
-        for name in (*folders, *files):
-            path = Path(place, name)
-            if path.is_symlink() and not _lies_in(root, path):
-                yield path
 
 
 def _lies_in(root: Path, path: Path) -> bool:

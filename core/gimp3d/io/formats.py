@@ -24,7 +24,6 @@ from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 SPZ_MAGIC = b"NGSP"
-SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
 DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
 SOG_DAMAGE = (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError)
 SPZ_HEADER = 16  # bytes
@@ -115,9 +114,9 @@ def _from_spz(path: Path) -> Gaussians:
     if len(body) < SPZ_HEADER or body[:4] != SPZ_MAGIC:
         raise BadInput(f"{path} is a gzip file, but no .spz scene")
     version, n, sh_degree, fraction_bits, flags = struct.unpack("<IIBBB", body[4:15])
-    if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS or (version == 4) == packed or fraction_bits > 24:
+    if not 1 <= version <= 4 or sh_degree > 3 or (version == 4) == packed or fraction_bits > 24:
         raise BadInput(f"{path}: .spz version {version} with SH degree {sh_degree} is not known")
-    count = SPZ_SH_COUNTS[sh_degree]
+    count = (sh_degree + 1) ** 2 - 1
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * count)  # bytes of each property
     require_memory(n * (sum(widths) + GAUSSIAN), f"{path} with {n} Gaussians")
     size = SPZ_HEADER + n * sum(widths)  # what its count needs; whatever else is packed there is not unpacked
@@ -132,8 +131,11 @@ def _from_spz(path: Path) -> Gaussians:
         low, middle, high = position.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
         fixed = low | middle << 8 | high << 16
         means = np.where(fixed & 0x800000, fixed - (1 << 24), fixed) / (1 << fraction_bits)
-    if version >= 3:
-        quats = _spz_quats(rotation.view("<u4")[:, 0])
+    if version >= 3:  # three components of 9 bits and a sign, in the order w, z, y, x from the lowest
+        words = rotation.view("<u4")
+        fields = words >> np.array([0, 10, 20], np.uint32) & 1023
+        small = (fields & 511) / 511 * SQRT_HALF * np.where(fields >> 9, -1, 1)
+        quats = _smallest_three(small, 3 - (words[:, 0] >> 30).astype(int))[:, [0, 3, 2, 1]]
     else:
         xyz = rotation / 127.5 - 1
         quats = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
@@ -172,13 +174,6 @@ def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
             body += stream.read(unpacked)
         offset += packed
     return bytes(body)
-
-
-def _spz_quats(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] from three components of 9 bits and a sign, in the order w, z, y, x from the lowest."""
-    fields = np.stack([packed >> shift & 1023 for shift in (0, 10, 20)], 1)
-    small = (fields & 511) / 511 * SQRT_HALF * np.where(fields >> 9, -1, 1)
-    return _smallest_three(small, 3 - (packed >> 30).astype(int))[:, [0, 3, 2, 1]]
 
 
 def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
