@@ -16,9 +16,9 @@ from .raster import footprint, touched_window
 from .run import Picture, ViewState
 from .stages.charts import Chart
 from .stages.depth import DepthCompletion
-from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
+from .stages.propagate.paper import MappingField
 from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed

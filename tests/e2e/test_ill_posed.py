@@ -32,8 +32,8 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import footprint, render
-from gimp3d.stages.mapping import mapping_field
 from gimp3d.stages.masks import find_masks
+from gimp3d.stages.propagate.paper import mapping_field
 from gimp3d.stages.reference import choose_reference
 
 UP = np.array([0, 0, 1.0])

@@ -13,9 +13,8 @@ from ..errors import IllPosed
 from ..geometry import disparity_of
 from ..priors.monodepth import DepthPrior, relative_disparity
 from ..schema import Signed
-from ..solvers.poisson import solve_poisson
+from ..solvers.poisson import solve_poisson, thin_plate
 from ..solvers.robust import CUT, robust_fit
-from ..solvers.thin_plate import thin_plate
 
 RING = 12  # px, width of the ring round the hole that is continued, and on which s_f is measured
 LEAST_PIXELS = 10  # of the ring below which nothing can be measured

@@ -17,9 +17,8 @@ from ..gaussians import Gaussians, decoded, linear
 from ..geometry import colours_at
 from ..raster import render
 from .charts.plane import Plane, extent
-from .ground import ROUGH, Ground
+from .ground import ROUGH, Ground, standing
 from .light_search import EARNS, FITS, places_elsewhere
-from .occluder import standing
 from .witness import Says, Witness, ask, spread
 
 MOST_VIEWS = 24

@@ -29,9 +29,9 @@ from ..raster import Window, drawing, render_bytes, surface_depth, touched_windo
 from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
-from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
+from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
 from ..stages.reference import rim
 
 SAME = 0.01  # relative z within which two references show the same surface

@@ -24,7 +24,6 @@ from gimp3d.errors import BadInput
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
 from gimp3d.stages import propagate as stage
-from gimp3d.stages.mapping import MappingField
 from gimp3d.stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -38,6 +37,7 @@ from gimp3d.stages.propagate import (
     paper,
     propagate,
 )
+from gimp3d.stages.propagate.paper import MappingField
 
 HOLE = (40, 60, 40, 65)  # rows and columns of T_0
 SHIFT = 30  # columns from a hole pixel to its source

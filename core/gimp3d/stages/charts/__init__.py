@@ -18,8 +18,7 @@ from ...box import Region, in_region
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
 from ...solvers.kriging import carried
-from ..mosaic import mosaic
-from ..witness import Says, Textures, Witness, ask
+from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
 from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_size
 from .find import find_planes as find_planes

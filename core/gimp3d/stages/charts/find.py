@@ -18,7 +18,7 @@ from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import WHOLE, framed, surface_points, window_round
 from ...schema import AtLeastOne, Share
-from ...solvers.thin_plate import thin_plate
+from ...solvers.poisson import thin_plate
 from ..witness import AGREEING, Says, Textures, Witness, ask
 from .plane import Plane, Surface, extent, largest_plane
 

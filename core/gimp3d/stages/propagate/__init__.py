@@ -20,8 +20,7 @@ from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
 from ...progress import Progress, silent
 from ...solvers.poisson import solve_poisson
 from ...solvers.robust import biweight
-from ..mapping import MappingField
-from .paper import Sampler
+from .paper import MappingField, Sampler
 from .warp import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint, warp_reference
 
 SURROUNDINGS = 0.75  # width of what is looked at round the hole, over the root of the hole's area

@@ -1,4 +1,6 @@
-"""The paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
+"""The mapping field: which source patch of the reference explains each filled one (paper 3.3; docs/method.md).
+
+And the paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
 
 Where the view does not show that source, another one near it that looks alike is taken (retargeting), else another
 view's pixel (`transfer="sample"`).
@@ -8,21 +10,106 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import parallel_map, run_ranges
-from ...geometry import SAME_DEPTH, colours_at
+from ...geometry import SAME_DEPTH, colours_at, surface_points
+from ...schema import Signed
+from ...solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
 from ...solvers.robust import exposure_gain
-from ..mapping import MappingField
+from ..witness import Says, Witness, ask, total_over
 from .warp import Loader, Picture, PropagateSettings, Reference, Rule, ViewToPaint, Warp, picture_of, shown_at
 
+MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 RADIUS = 2  # px of the overlapping patches that are compared and blended (paper 4.1: 5 × 5)
 ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source is alike
 OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
+
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How sources are judged."""
+
+    visibility: Signed = 0.002  # squared colour difference, λ_v of eq. 8, (11 grey levels)²; likeness, what views see
+    as_printed: bool = False  # compared at f(p), copied from p + f(p); nothing: the paper's cost misses p
+    patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
+
+
+@dataclass(frozen=True)
+class MappingField:
+    """f as absolute source coordinates."""
+
+    rows: np.ndarray  # [H, W] int32, -1 where there is none
+    cols: np.ndarray  # [H, W] int32
+    confidence: float
+    reason: str
+
+
+def source_visibility(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z-depth of the reference, 0 = nothing
+    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, hidden pixels)
+) -> np.ndarray:
+    """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden."""
+    rows, cols, points = surface_points(camera, np.where(np.isfinite(depth), depth, 0))
+
+    def shown(view: tuple[Camera, np.ndarray, np.ndarray]) -> np.ndarray:
+        other, z, hidden = view
+        no = np.zeros_like(hidden)
+        witness = Witness(other, np.empty((0, 0, 3), np.uint8), hidden, no, no, z)
+        return ask([witness], points, SAME_DEPTH)[0] == Says.SEEN
+
+    share = np.zeros(depth.shape, np.float32)
+    share[rows, cols] = total_over(views, shown, rows.shape) / max(1, len(views))
+    return share
+
+
+def mapping_field(
+    image: np.ndarray,  # [H, W, 3] uint8, the inpainted reference
+    target: np.ndarray,  # [H, W] bool, T_0
+    source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
+    visibility: np.ndarray,  # [H, W] float32, see source_visibility
+    settings: MappingSettings = MappingSettings(),
+    seed: int = 0,
+) -> MappingField:
+    """The field f* that minimises misfit, incoherence and λ_v (1 − v) over T_0 (paper eq. 8, sign mended).
+
+    The target's colours are known (the reference is inpainted already), so no EM is needed.
+    """
+    penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
+    patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
+    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
+    if settings.as_printed:
+        nearest = _moved_by_places(nearest, source)
+    found = nearest.found
+    if not target.any():
+        confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
+    elif not found.any():
+        confidence = 0.0
+        reason = "no source patch: the reference shows nothing but the hole; its own colours are warped"
+    else:
+        rows, cols = nearest.rows[found], nearest.cols[found]
+        appearance = (nearest.cost[found] - penalty[rows, cols]) / (1 - patchmatch.coherence)
+        misfit = 255 * float(np.sqrt(max(0.0, appearance.mean())))
+        confidence = float(np.exp(-misfit / MISFIT))
+        reason = f"fill explained to {misfit:.1f} grey levels; "
+        reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
+    return MappingField(nearest.rows, nearest.cols, confidence, reason)
+
+
+def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
+    """The place that was compared taken as the offset f(p); none where p + f(p) is no source."""
+    places = np.argwhere(nearest.found)
+    moved = places + np.stack([nearest.rows, nearest.cols], -1)[nearest.found]
+    kept = (moved < source.shape).all(1)
+    kept[kept] = source[tuple(moved[kept].T)]
+    rows, cols = np.full((2, *source.shape), -1, np.int32)
+    rows[tuple(places[kept].T)], cols[tuple(places[kept].T)] = moved[kept].T
+    return replace(nearest, rows=rows, cols=cols)
 
 
 @dataclass(frozen=True)

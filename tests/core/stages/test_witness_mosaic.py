@@ -14,8 +14,7 @@ from scenes import cameras
 
 from gimp3d.camera import Camera
 from gimp3d.orbit import look_at
-from gimp3d.stages.mosaic import mosaic
-from gimp3d.stages.witness import Says, Witness, ask
+from gimp3d.stages.witness import Says, Witness, ask, mosaic
 
 UP = np.array([0.0, 0, 1])
 ABOVE = Camera("above", 100, 80, 400.0, 400.0, 50.0, 40.0, look_at(4 * UP, np.zeros(3), np.array([0.0, 1, 0])))
