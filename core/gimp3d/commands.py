@@ -301,17 +301,24 @@ def run_removal(
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
         results.append(remove_object(scene, views, region, of_variant, *given))
     summary = summary_of(job, settings, file, results, warnings, time.perf_counter() - start)
+    if job.report:
+        write_removal_report(Path(job.report), scene, views, results, summary)
+    _write_results(job, folder, file, results, summary)
+    return summary
+
+
+def _write_results(
+    job: RemovalJob, folder: Path | None, file: SplatFile, results: Sequence[RemovalResult], summary: dict[str, Any]
+) -> None:
+    """Views, charts, summary, and the scenes, OUT last: as it was until all has gone well."""
     if job.views_out:
         for name, image in results[0].painted.items():
             write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
         write_charts(Path(job.views_out) / "charts", results[0].charts)
-    if job.report:
-        write_removal_report(Path(job.report), scene, views, results, summary)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_json(Path(path), summary)
     for path, result in reversed(list(zip(job.outs(), results))):
-        write_ply(path, file, result.keep, result.added)  # OUT last: as it was until all has gone well
-    return summary
+        write_ply(path, file, result.keep, result.added)
 
 
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:

@@ -101,8 +101,7 @@ def complete_depth(
         nearest = scipy.ndimage.distance_transform_edt(~around, return_distances=False, return_indices=True)
         filled = np.where(unknown, scene[tuple(nearest)], filled)
         reasons.append("a part of the hole has no rim: nearest depth used")
-    finite = scene[around & (scene > 0)]
-    low, high = (LOW * finite.min(), HIGH * finite.max()) if len(finite) else (0.0, 0.0)
+    low, high = _range(scene[around])
     if (scene[around] == 0).any():  # where the ring shows sky, so far means infinitely far
         filled, low = np.where(filled < low, 0.0, filled), 0.0
     clamped = int((hole & ((filled < low) | (filled > high))).sum())
@@ -113,6 +112,12 @@ def complete_depth(
         confidence *= 0.3
     result = np.where(hole, np.clip(filled, low, high), scene).astype(np.float32)
     return DepthCompletion(result, disparity_of(result), confidence, "; ".join(reasons), fit, clamped)
+
+
+def _range(disparities: np.ndarray) -> tuple[float, float]:
+    """Within which a completed disparity is believed, by those round the hole, 0 for sky."""
+    finite = disparities[disparities > 0]
+    return (LOW * float(finite.min()), HIGH * float(finite.max())) if len(finite) else (0.0, 0.0)
 
 
 def _continued(scene: np.ndarray, ring: np.ndarray, hole: np.ndarray, surface: str) -> tuple[np.ndarray, str]:

@@ -31,8 +31,7 @@ WALL_POINTS = 60_000  # points of surface, about, among which walls are sought
 WALL_INLIER = 0.03  # diagonals of the region from a plane within which a point lies on it
 WALL_SHARE = 0.25  # share of the points above the known planes that a wall holds
 VIEWED = 1.25  # times the usual spread of photos beyond which they show something else
-
-Ground = Facing  # what photos show of a surface round the object, coarsely
+# Of the volume that stands for the object:
 CELLS = 40  # along the longest side
 SAMPLES = 16  # of every Gaussian, by which it is spread over cells
 FAINT = 0.05  # opacity below which a Gaussian blocks nothing worth telling
@@ -41,6 +40,8 @@ LOW = 0.03  # of the diagonal: what is lower is the surface that went along
 LOWEST = 5.0  # percentile of what is removed that is its lowest part; a box cuts into the floor
 STANDS = 0.1  # of the diagonal: an object whose lowest parts are no higher stands on the surface
 STEP = 0.8  # cells that a ray goes at once
+
+Ground = Facing  # what photos show of a surface round the object, coarsely
 
 
 def look_at(planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region) -> list[Ground]:
