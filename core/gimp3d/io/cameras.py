@@ -257,18 +257,12 @@ def _read_transforms(path: Path, document: dict[str, Any], photos: Path) -> Iter
         if not isinstance(given, dict) or given.get("transform_matrix") is None:
             raise BadInput(f"{where}: no transform_matrix")
         entry: _Entry = checked(_Entry, {**of_all, **given}, where, extra=True)
-        refuse_model(entry.camera_model, where)
-        if entry.is_fisheye:
-            refuse_model("FISHEYE", where)
+        refuse_model("FISHEYE" if entry.is_fisheye else entry.camera_model, where)
         viewmat = _inverted(rigid(entry.transform_matrix, where) @ OPENGL_TO_OPENCV)
-        yield _camera(entry, where, _exactly(viewmat, entry.world_to_camera), photos)
-
-
-def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
-    """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
-    exact = _numbers(told)
-    same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
-    return exact if same else viewmat
+        exact = _numbers(entry.world_to_camera)
+        if exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max()):
+            viewmat = exact  # as `write_transforms` told it; another program has not changed the pose since
+        yield _camera(entry, where, viewmat, photos)
 
 
 def _photo(folder: Path, name: str) -> Path:

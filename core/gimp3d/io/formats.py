@@ -77,32 +77,31 @@ def _from_compressed_ply(path: Path) -> Gaussians:
     """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
     _, elements, offset = header_of(path)
     data, tables = path.read_bytes(), {}
-    with refusing(f"{path}: a damaged compressed PLY", KeyError, ValueError):
-        for element in elements:
-            kind = np.dtype([(n, "<" + TYPES[kind]) for n, kind in element.properties.items() if kind != "list"])
-            if offset + element.count * kind.itemsize > len(data):
-                raise BadInput(f"{path} is truncated: element {element.name} is not whole")
-            tables[element.name] = np.frombuffer(data, kind, element.count, offset)
-            offset += element.count * kind.itemsize
-        vertex, bounds = tables["vertex"], tables["chunk"]
-        if len(bounds) * CHUNK_ROWS < len(vertex):
-            raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
-        chunk = np.arange(len(vertex)) // CHUNK_ROWS
+    for element in elements:
+        kind = np.dtype([(n, "<" + TYPES[t]) for n, t in element.properties.items() if t != "list"])
+        if offset + element.count * kind.itemsize > len(data):
+            raise BadInput(f"{path} is truncated: element {element.name} is not whole")
+        tables[element.name] = np.frombuffer(data, kind, element.count, offset)
+        offset += element.count * kind.itemsize
+    vertex, bounds = tables["vertex"], tables["chunk"]
+    if len(bounds) * CHUNK_ROWS < len(vertex):
+        raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
+    chunk = np.arange(len(vertex)) // CHUNK_ROWS
 
-        def between(unit: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-            low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
-            return low + unit * (high - low)
+    def between(unit: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+        low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
+        return low + unit * (high - low)
 
-        means = between(_unpack(vertex["packed_position"], 11, 10, 11), ("x", "y", "z"))
-        log_scales = between(_unpack(vertex["packed_scale"], 11, 10, 11), ("scale_x", "scale_y", "scale_z"))
-        rgba = _unpack(vertex["packed_color"], 8, 8, 8, 8)
-        rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
-        packed = vertex["packed_rotation"]
-        quats = _smallest_three((_unpack(packed, 10, 10, 10) - 0.5) * 2 * SQRT_HALF, (packed >> 30).astype(int))
-        rest, higher = tables.get("sh"), None
-        if rest is not None and rest.dtype.names:
-            steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
-            higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
+    means = between(_unpack(vertex["packed_position"], 11, 10, 11), ("x", "y", "z"))
+    log_scales = between(_unpack(vertex["packed_scale"], 11, 10, 11), ("scale_x", "scale_y", "scale_z"))
+    rgba = _unpack(vertex["packed_color"], 8, 8, 8, 8)
+    rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
+    packed = vertex["packed_rotation"]
+    quats = _smallest_three((_unpack(packed, 10, 10, 10) - 0.5) * 2 * SQRT_HALF, (packed >> 30).astype(int))
+    rest, higher = tables.get("sh"), None
+    if rest is not None and rest.dtype.names:
+        steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
+        higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
     return _gaussians(path, means, log_scales, quats, rgba[:, 3], (rgb - 0.5) / SH_C0, higher)
 
 
