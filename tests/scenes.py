@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gimp3d.behind import Behind, look_behind
 from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
-from gimp3d.pipeline import Behind, look_behind
 from gimp3d.presets import PRESETS, RemovalSettings
 from gimp3d.raster import render_bytes
 from gimp3d.run import Run

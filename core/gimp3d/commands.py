@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from . import __version__
+from .behind import BEFORE_FILL
 from .box import read_region
 from .camera import Camera, output_name
 from .compute.jit import announce_compilation
@@ -29,7 +30,7 @@ from .job import MOST_VARIANTS, RemovalJob, SharedStages, StageStore
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
 from .pictures import of_light
-from .pipeline import BEFORE_FILL, RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
+from .pipeline import RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
 from .presets import job_settings, shadow_of
 from .progress import Progress, silent
 from .raster import RasterSettings, render

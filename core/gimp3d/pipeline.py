@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from . import pictures
+from .behind import Behind, look_behind
 from .box import Region
 from .compute.threads import parallel_map
 from .errors import BadInput, IllPosed
@@ -21,20 +22,10 @@ from .priors.monodepth import depth_provider
 from .progress import Progress, silent
 from .raster import render_bytes
 from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels
-from .stages.charts import Chart
-from .stages.exposure import exposures_of, levelled
-from .stages.masks import Masks, find_masks
+from .stages.masks import find_masks
 from .stages.verdict import Verdict, judge
 from .steps.behind import (
-    NOT_LIT,
-    Charted,
     Relit,
-    chart_surfaces,
-    find_light,
-    find_surfaces,
-    relearn,
-    undo_light,
-    with_contact,
 )
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
 
@@ -43,28 +34,6 @@ __all__ = [
     "provider_notices", "remove_object", "render_bytes",
 ]  # fmt: skip
 REFINERS = ("command", "http", "https")  # who may be asked to refine views
-LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
-# stages that know nothing of fills
-BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "surfaces 2", "charts 3", "relearn")
-
-
-@dataclass(frozen=True)
-class Behind:
-    """What is behind the object, and the scene in the light that it would have without it."""
-
-    before: Gaussians  # the scene with the object, in that light
-    scene: Gaussians  # the same, but what stays round the object is learned anew
-    changed: np.ndarray  # [M] rows of it that are not as they came
-    masks: Masks  # with what had to be cleared away; if there are charts, T is what no photo shows of them
-    views: tuple[ViewState, ...]
-    charts: tuple[Chart, ...]
-    lit: Relit
-
-    def recoloured(self, kept: Gaussians, rows: np.ndarray) -> Behind:
-        """With what stays, of which the rows [M] have other colours now."""
-        stays = np.flatnonzero(~self.masks.removed)
-        scene = self.scene.with_rows(stays[rows], kept.take(rows))
-        return replace(self, scene=scene, changed=np.union1d(self.changed, stays[rows]))
 
 
 def remove_object(
@@ -146,61 +115,6 @@ def look(
     if masks.removed.any() and (left_out := len(cameras) - len(masks.views)):
         run.warnings.append(f"{left_out} views do not frame the region or lie inside it: not used")
     return look_behind(run, scene, region, masks, photos, shadow_masks)
-
-
-def look_behind(
-    run: Run,
-    scene: Gaussians,
-    region: Region,
-    masks: Masks,
-    photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, of every view
-    shadow_masks: Mapping[str, np.ndarray],
-) -> Behind:
-    """Level the photos, find the surfaces that the object hid, undo its shadow and reflection, draw the charts."""
-    settings, region, lit = run.settings, masks.grown(region), NOT_LIT
-    if not masks.removed.any():
-        return Behind(scene, scene, lit.rows, masks, (), (), lit)
-    exposures = run("exposure", exposures_of, scene.take(~masks.removed), masks.views, photos, words=levelled)
-    views = tuple(ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures))
-    if settings.charts is None or masks.mode != "need":
-        return Behind(scene, scene, lit.rows, masks, views, (), lit)
-    inputs = scene, region, masks, views, settings
-    surfaces = run("surfaces", find_surfaces, *inputs)
-    masks = replace(masks, selection=surfaces.selection)
-
-    def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Charted]:
-        """What the object does to the light undone, and the charts as they are then."""
-        light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
-        lit = replace(found, lifted=light)
-        bounded = surfaces if light is None else surfaces.with_marked(light.dark)
-        inputs = lit.scene(scene), region, bounded, lit.views(views), settings
-        return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
-
-    found = NOT_LIT
-    if settings.shadow != "off":
-        found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
-        if isinstance(found.shadow, str) and settings.shadow == "mask":
-            run.warnings.append(found.shadow)
-    lit, charted = in_light(found)
-    if isinstance(found.shadow, str) and settings.shadow == "auto":
-        found = run("contact", with_contact, found, charted.charts)
-        again = not isinstance(found.shadow, str)
-        lit, charted = in_light(found, " 2") if again else (replace(found, lifted=lit.lifted), charted)
-    if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
-        surfaces = run("surfaces 2", find_surfaces, *inputs, False)
-        masks = replace(masks, selection=surfaces.selection)
-        lit, charted = in_light(found, " 3")
-    scene, views = lit.scene(scene), lit.views(views)
-    if charted.charts:
-        masks = replace(masks, selection=charted.selection, views=tuple(m for m, _ in charted.targets))
-        views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, charted.targets))
-    behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
-    if not settings.refine.steps:
-        return behind
-    given = scene, region, masks.removed, views, charted.charts, settings, run.progress
-    learned = run("relearn", relearn, *given)
-    scene = scene.with_rows(learned.rows, learned.gaussians)
-    return replace(behind, scene=scene, changed=np.union1d(lit.rows, learned.rows))
 
 
 def _filled(

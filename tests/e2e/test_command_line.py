@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
 
-from gimp3d import filling, pipeline
+from gimp3d import behind, filling, pipeline
 from gimp3d.camera import output_name
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
@@ -129,8 +129,10 @@ def test_a_job_runs_alone_moves_and_resumes(
     (job / "out.ply").unlink()
     moved = tmp_path / "moved"
     job.rename(moved)
-    for stage in ("find_masks", "exposures_of", "find_surfaces", "find_light", "chart_surfaces", "judge"):
+    for stage in ("find_masks", "judge"):
         monkeypatch.setattr(pipeline, stage, again)
+    for stage in ("exposures_of", "find_surfaces", "find_light", "chart_surfaces"):
+        monkeypatch.setattr(behind, stage, again)
     for stage in ("paint_chart", "paint_views"):
         monkeypatch.setattr(references, stage, again)
     for stage in ("seed_gaussians", "settle_gaussians", "refine_gaussians"):

@@ -13,9 +13,9 @@ import pytest
 from scenes import BLOCK, REGION, cameras, charted, scene, truth
 
 from benchmarks.perturbations import moved, noisy_depths, resized, turned
+from gimp3d.behind import Behind
 from gimp3d.box import Box
 from gimp3d.gaussians import Gaussians
-from gimp3d.pipeline import Behind
 from gimp3d.presets import PRESETS
 from gimp3d.raster import surface_depth
 

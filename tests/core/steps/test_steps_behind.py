@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scenes import BLOCK, REGION, cameras, floor, scene
 
+from gimp3d.behind import Behind, look_behind
 from gimp3d.evaluate import psnr
 from gimp3d.gaussians import ARRAYS, Gaussians
 from gimp3d.geometry import dilated
-from gimp3d.pipeline import PRESETS, Behind, View, look_behind, remove_object, render_bytes
+from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.run import Run
 from gimp3d.stages import refine
 from gimp3d.stages.charts import pictured
