@@ -273,9 +273,8 @@ def take_painted_colours(kept: Gaussians, added: Gaussians, views: Sequence[View
     wanted = [np.isin(v.rules, OWN_RULES) for v in views if v.rules is not None]
     views = [v for v in views if v.rules is not None]
     hidden = [(v.masks.silhouette | v.masks.target) & ~own for v, own in zip(views, wanted)]
-    no = [np.zeros_like(h) for h in hidden]
+    no, whole, painted = [np.zeros_like(h) for h in hidden], kept.extended(added), [v.painted for v in views]
     witnesses = [Witness(v.camera, v.painted, h, n, n, v.masks.depth_before) for v, h, n in zip(views, hidden, no)]
-    whole, painted = kept.extended(added), [v.painted for v in views]
     may = (np.arange(len(whole)) < len(kept)) & whole.usable & np.isfinite(whole.opacity_logits)
     rows, sh = recoloured(whole, np.zeros(len(whole), bool), witnesses, painted, wanted, wanted, 0, may)
     seen = np.abs(sh[:, 0] - kept.sh[rows, 0]).max(1) > VISIBLE / SH_C0

@@ -66,9 +66,8 @@ def lay_planes(
     planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, settings: ChartSettings = ChartSettings()
 ) -> tuple[Laid, ...]:
     """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
-    textures = Textures.make(witnesses)
-    flats = [_placed(plane, region, witnesses, settings.largest) for plane in planes]
-    laid = [lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None]
+    textures, flats = Textures.make(witnesses), (_placed(p, region, witnesses, settings.largest) for p in planes)
+    laid = (lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None)
     return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
 
 

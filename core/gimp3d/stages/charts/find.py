@@ -338,5 +338,4 @@ def _drawn_surface(
     count = np.bincount(key.astype(int), minlength=h * w)
     known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
     value[known] = z[(np.cumsum(count) - count + count // 2)[known]]
-    value, known = value.reshape(h, w), known.reshape(h, w)
-    return np.where(known, value - away, 0), known
+    return np.where(known, value - away, 0).reshape(h, w), known.reshape(h, w)
