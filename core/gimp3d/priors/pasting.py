@@ -205,9 +205,7 @@ def shift_between(image: np.ndarray, picture: np.ndarray, known: np.ndarray) -> 
     h, w = known.shape
     warp = np.eye(2, 3, dtype=np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
-    for factor in (4, 2, 1):
-        if min(h, w) < 32 * factor:
-            continue
+    for factor in (f for f in (4, 2, 1) if min(h, w) >= 32 * f):
         size = (w // factor, h // factor)
         mask = cv2.resize(known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         view, other = (_details(p, size, mask > 0).astype(np.float32) for p in (image, picture))

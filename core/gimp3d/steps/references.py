@@ -132,9 +132,8 @@ def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSet
     if turn.picture is not None:
         return paste_picture(chart.image, hole | chart.hole, turn.picture, "--reference-image", chart.known)
     of_another = settings.inpaint.startswith("file:") and turn.name is None
-    who, seed = "exemplar" if of_another else settings.inpaint, settings.random_seed
-    unknown = ~chart.known & ~hole
-    return inpaint_reference(who, chart.image, hole, seed, unknown=unknown, call=call, variant=settings.variant)
+    who, unknown = "exemplar" if of_another else settings.inpaint, ~chart.known & ~hole
+    return inpaint_reference(who, chart.image, hole, settings.random_seed, unknown, call, settings.variant)
 
 
 def complete_view_depth(
@@ -172,9 +171,8 @@ def paint_view(
         base = np.where(seen[..., None], shown, base)
     if picture is not None:
         return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
-    filled = inpaint_reference(
-        settings.inpaint, base, masks.target & ~seen, settings.random_seed, call=call, variant=settings.variant
-    )
+    hole, seed = masks.target & ~seen, settings.random_seed
+    filled = inpaint_reference(settings.inpaint, base, hole, seed, None, call, settings.variant)
     share = seen.sum() / max(1, masks.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
