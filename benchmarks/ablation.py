@@ -86,7 +86,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
-    "islands in a chart's hole stay": (("gimp3d.stages.charts:_without_islands", lambda hole, _: hole),),
     # what stays round it
     "what stays learns nothing": (("gimp3d.steps.behind:SHOWN", math.inf),),
     "charts teach what stays nothing": (("gimp3d.steps.behind:WRONG", math.inf),),

@@ -117,7 +117,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
     colours = _object_colours(laid.plane, witnesses, tolerance)
     inside, filled = in_region(region, texels).reshape(shape), _marked(texels, witnesses, marked).reshape(shape)
     below, rests, foreign = _told_by_colours(shown, colours, inside, filled)
-    hole = _without_islands((shown.hole & ~below) | rests, ((shown.photos < 2) & shown.there) | below)
+    hole = (shown.hole & ~below) | rests
     below &= ~hole
     return Chart(
         **vars(laid),
@@ -232,14 +232,6 @@ def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np
             off = image[y[there], x[there]].astype(np.float32) - image[rows[there], cols[there]]
             least[there] = np.minimum(least[there], (off**2).mean(-1))
     return np.sqrt(np.where(np.isfinite(least), least, 0))
-
-
-def _without_islands(hole: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
-    """[H, W] bool: the hole with what is doubtful in it: one photo's word through a gap, or what is below masks.
-
-    The object's foot may have the surface's colours, and what stands before it shows through its mask.
-    """
-    return hole | (scipy.ndimage.binary_fill_holes(hole) & doubtful)
 
 
 def usual_spread(spread: np.ndarray) -> float:
