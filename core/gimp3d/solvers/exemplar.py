@@ -152,7 +152,7 @@ def _filled(
         rounds, usual = COARSE_ROUNDS, 0.0  # cost of patches that were found; not known at first
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
         colours = level.channels[rows[hole], cols[hole]]
-        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
+        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32))
         index = index_patches(lay_out(shown[..., :3].copy(), radius), allowed, TREE_GRID)
     else:
         rounds, usual = 1, float(np.median(coarser.cost[coarser.found]))
@@ -168,7 +168,7 @@ def _filled(
         heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
         guided = np.dstack([shown[..., 3:], level.edges, heed * level.expected.colours])
         matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
-        field = refined(field, patches, level.touching, allowed, matching, penalty, index, guided, tree_sweeps=1)
+        field = refined(field, patches, level.touching, allowed, matching, penalty, guided, index, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))
         return field, _voted(level, field, colours)
 

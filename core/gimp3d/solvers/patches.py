@@ -157,7 +157,7 @@ def leaf_of(wanted, at, split_component, split_value):
 
 @kernel
 def _split(lo, hi, ends, found, order, split_component, split_value):
-    """Part the patches of each node [ends[k], ends[k + 1]) into two halves along the component where they spread most."""
+    """Part the patches of each node [ends[k], ends[k + 1]) in two along the component where they spread most."""
     for k in range(lo, hi):
         if ends[k + 1] - ends[k] < 2:
             continue

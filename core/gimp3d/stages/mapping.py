@@ -88,10 +88,8 @@ def mapping_field(
 
 def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
     """The place that was compared taken as the offset f(p); none where p + f(p) is no source."""
-    places = np.argwhere(nearest.found)
-    moved = places + np.stack([nearest.rows, nearest.cols], -1)[nearest.found]
-    kept = (moved < source.shape).all(1)
-    kept[kept] = source[tuple(moved[kept].T)]
-    rows, cols = np.full((2, *source.shape), -1, np.int32)
-    rows[tuple(places[kept].T)], cols[tuple(places[kept].T)] = moved[kept].T
-    return replace(nearest, rows=rows, cols=cols)
+    moved = np.stack([nearest.rows, nearest.cols]) + np.indices(source.shape)
+    kept = nearest.found & (moved[0] < source.shape[0]) & (moved[1] < source.shape[1])
+    kept[kept] = source[tuple(moved[:, kept])]
+    rows, cols = np.where(kept, moved, -1).astype(np.int32)
+    return nearest._replace(rows=rows, cols=cols)
