@@ -14,10 +14,10 @@ from .geometry import disparity_of, window_mask
 from .raster import footprint, touched_window
 from .run import Picture
 from .stages.charts import Chart
-from .stages.depth import DepthCompletion
 from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
+from .stages.reference import DepthCompletion
 from .stages.view_refinement import ViewRefinement
 from .steps.behind import Relit
 from .steps.references import Completed

@@ -10,7 +10,7 @@ import numpy as np
 from ..camera import Camera
 from ..geometry import SAME_DEPTH, surface_points
 from ..schema import Signed
-from ..solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
+from ..solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field
 from .witness import Says, Witness, ask, total_over
 
 MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
@@ -68,8 +68,12 @@ def mapping_field(
     penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
     patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
     nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
-    if settings.as_printed:
-        nearest = _moved_by_places(nearest, source)
+    if settings.as_printed:  # the place that was compared is taken as the offset f(p); none where p + f(p) is no source
+        moved = np.stack([nearest.rows, nearest.cols]) + np.indices(source.shape)
+        kept = nearest.found & (moved[0] < source.shape[0]) & (moved[1] < source.shape[1])
+        kept[kept] = source[tuple(moved[:, kept])]
+        rows, cols = np.where(kept, moved, -1).astype(np.int32)
+        nearest = nearest._replace(rows=rows, cols=cols)
     found = nearest.found
     if not target.any():
         confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
@@ -84,12 +88,3 @@ def mapping_field(
         reason = f"fill explained to {misfit:.1f} grey levels; "
         reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
     return MappingField(nearest.rows, nearest.cols, confidence, reason)
-
-
-def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
-    """The place that was compared taken as the offset f(p); none where p + f(p) is no source."""
-    moved = np.stack([nearest.rows, nearest.cols]) + np.indices(source.shape)
-    kept = nearest.found & (moved[0] < source.shape[0]) & (moved[1] < source.shape[1])
-    kept[kept] = source[tuple(moved[:, kept])]
-    rows, cols = np.where(kept, moved, -1).astype(np.int32)
-    return nearest._replace(rows=rows, cols=cols)

@@ -27,11 +27,10 @@ from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
 from ..stages.charts import CHART, Chart, chart_number, pictured
-from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
-from ..stages.reference import rim
+from ..stages.reference import DepthCompletion, PriorFit, complete_depth, rim
 from ..stages.refine import looked_at
 from ..stages.seed import seed_gaussians, settle_gaussians
 from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
@@ -156,7 +155,7 @@ def complete_view_depth(
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
         words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(disparity_of(depth), depth, share, words, PriorFit())
+        return DepthCompletion(depth, share, words, PriorFit())
     looked_at = None
     spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
     if looks(spec):

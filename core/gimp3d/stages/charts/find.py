@@ -18,7 +18,7 @@ from ...camera import Camera
 from ...compute.threads import parallel_map
 from ...geometry import SOLID, WHOLE, framed, surface_points, window_round
 from ...schema import AtLeastOne, Share
-from ...solvers.thin_plate import thin_plate
+from ...solvers.poisson import thin_plate
 from ..masks import ViewMasks
 from ..witness import AGREEING, Says, Textures, Witness, ask
 from .plane import Plane, Surface, extent, largest_plane
@@ -310,7 +310,7 @@ def lay_surface(
     offset, known = _drawn_surface(flat, views, witnesses, HEIGHT * diagonal, enough)
     if known.sum() < TELLING:
         return level
-    completed = np.nan_to_num(thin_plate(offset, known.astype(float), np.ones(known.shape, bool))).astype(np.float32)
+    completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
     relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
     # splats are drawn a little behind the surface that they show: new ones must lie where they do
     near = offset[known & (np.abs(offset) < SINKS * diagonal)]
