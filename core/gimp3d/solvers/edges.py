@@ -240,10 +240,9 @@ def _settled(
             return told, edge if steady else None
         inwards = 1 if side == BEFORE else -1
         enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
-        if _goes_on(beyond[:, :CLOSE], told_by):
-            return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE, True)
+        seen = _goes_on(beyond[:, :CLOSE], told_by)
         dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-        return told, _Half(edge, inwards, enters, leaves, bool(dark))
+        return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
 
     best, found = pattern_search(at, np.eye(2))
     return found if best > 0 else None

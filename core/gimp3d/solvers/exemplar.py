@@ -118,8 +118,7 @@ def _by_patches(
         return None
     field: NearestNeighbourField | None = None
     expected = expect(image / np.float32(255), hole, ~(hole | unknown))
-    for finer in reversed(range(len(levels))):
-        channels, open_ = levels[finer]
+    for finer, (channels, open_) in reversed([*enumerate(levels)]):
         barred = cv2.resize(unknown.astype(np.float32), open_.shape[::-1], interpolation=cv2.INTER_AREA) > 0
         smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture
         guide = GUIDE * guide_of(edges, open_.shape, 2**finer, max(radius, 1))
@@ -179,18 +178,12 @@ def _filled(
         if change < SETTLED:
             break
     for number in range(rounds, rounds + mosaics):
-        field = _sources(level, field, colours)
+        shown[hole] = colours
+        field = shift_map(shown[..., :3].copy(), hole, level.usable, field)
         there = field.found[hole]
         copied = np.where(there[:, None], level.channels[field.rows[hole], field.cols[hole]], colours)
         field, colours = matched(field, copied, number)
     return colours, field
-
-
-def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> NearestNeighbourField:
-    """Where each of the hole's pixels is copied from; no patch's centre, so nothing may be voted with it."""
-    picture = level.channels[..., :3].copy()
-    picture[level.hole] = colours[:, :3]
-    return shift_map(picture, level.hole, level.usable, field)
 
 
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
@@ -200,11 +193,10 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     what the two pixels are copied from has its say. Rim pixels that the patches do not agree with at all, such as
     remains of what was removed, do not spread.
     """
-    box = bounds(level.hole, 1)
-    hole, corner = level.hole[box], np.array([b.start for b in box])
-    picture = level.channels[box][..., :3].copy()
-    picture[hole] = colours[:, :3]
-    sources = _sources(level, field, colours)
+    picture, box = level.channels[..., :3].copy(), bounds(level.hole, 1)
+    picture[level.hole] = colours[:, :3]
+    sources = shift_map(picture, level.hole, level.usable, field)
+    hole, picture, corner = level.hole[box], picture[box], np.array([b.start for b in box])
     rim = dilated(hole, 1) & ~hole & level.usable[box]
     said = _voted(level, field, picture[rim], np.argwhere(rim) + corner)
     rim[rim] = np.abs(said - picture[rim]).max(1) < DISAGREEMENT
@@ -325,12 +317,11 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
                 if weight > 0.0:
                     v, u = rows[a, b] + y - a, cols[a, b] + x - b
                     total += weight
-                    if differs:
-                        for c in range(count):
-                            sums[c] += weight * (channels[v + dy, u + dx, c] - channels[v, u, c])
-                    else:
-                        for c in range(count):
-                            sums[c] += weight * channels[v, u, c]
+                    for c in range(count):
+                        value = channels[v + dy, u + dx, c]
+                        if differs:
+                            value -= channels[v, u, c]
+                        sums[c] += weight * value
         if total > 0.0:
             for c in range(count):
                 voted[k, c] = sums[c] / total

@@ -29,6 +29,8 @@ LEAST_BAND = 6  # px
 PLAIN = 3 * 255.0**-2  # variance of the surroundings, one grey level in each channel, below which nothing is regular
 RIM = 4  # px right beside the hole
 
+Places = tuple[np.ndarray, np.ndarray]  # rows and columns of pixels
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -101,7 +103,7 @@ def _band(hole: np.ndarray, known: np.ndarray) -> np.ndarray:
     return known & (far <= max(LEAST_BAND, 2 * BAND * thickness))
 
 
-def _variance(image: np.ndarray, where: np.ndarray | tuple[np.ndarray, np.ndarray]) -> float:
+def _variance(image: np.ndarray, where: np.ndarray | Places) -> float:
     return float(image[where].var(0).sum())
 
 
@@ -155,7 +157,7 @@ def _of_turn(
 def _settled(
     image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, guess: tuple[float, bool, np.ndarray]
 ) -> Motion | None:
-    """The motion near a guess of angle, mirrored, shift that explains most, if that is enough; it turns about the hole."""
+    """The motion near a guess that explains most, if that is enough; it turns about the hole."""
     angle, mirrored, shift = guess
     ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (known & dilated(hole, RIM), 4000)))
     shows = known.astype(np.float32)
@@ -166,9 +168,7 @@ def _settled(
         turn = turn_of(angle + values[0], mirrored)
         return turn, target + values[1:] - turn @ middle
 
-    def explained(
-        values: np.ndarray, of: tuple[np.ndarray, np.ndarray] = ring, overlap: float = OVERLAP
-    ) -> tuple[float, np.ndarray]:
+    def explained(values: np.ndarray, of: Places = ring, overlap: float = OVERLAP) -> tuple[float, np.ndarray]:
         """Share of the variance of the pixels, and the values; so many of them must be mapped to something known."""
         rows, cols = of
         y, x = _mapped(*at(values), rows, cols)
@@ -203,7 +203,7 @@ def pattern_search(at: Callable[[np.ndarray], tuple[float, Any]], axes: np.ndarr
     return best
 
 
-def _thinned(where: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(where: np.ndarray, most: int) -> Places:
     rows, cols = np.nonzero(where)
     step = max(1, -(-len(rows) // most))
     return rows[::step], cols[::step]

@@ -163,11 +163,10 @@ def fit_prior(
     """Measure s_f by a robust affine fit of the scene's disparity to the prior round the hole (docs/method.md), unless
     it is given. Maps are [H, W]: `around` bool, where disparity is known round the hole; NaN is no value of a prior.
 
-    The fit tells the prior's units. Whether to follow it into the hole is another question: what a plane tells as well
-    needs no prior. It is believed as far as its relief on the ring is the scene's, or as far as its relief in the hole
-    is larger than its error on the ring, whichever is more: foliage and the swirls of rough scans drown the first of a
-    prior that is right, and smooth errors, which the hole's rim takes away, the second. s_f is 0 where the prior says
-    nothing: too few pixels, no variance, a slope ≤ 0.
+    The fit tells the prior's units. It is believed as far as its relief on the ring is the scene's, or as far as its
+    relief in the hole is larger than its error on the ring, whichever is more: foliage and the swirls of rough scans
+    drown the first of a prior that is right, and smooth errors, which the hole's rim takes away, the second. s_f is 0
+    where the prior says nothing: too few pixels, no variance, a slope ≤ 0.
     """
     ring = around & (disparity > 0) & np.isfinite(prior)
     m, d = prior[ring].astype(np.float64), disparity[ring].astype(np.float64)
