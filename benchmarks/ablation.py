@@ -83,7 +83,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what stands on holes stays if a photo shows it": (
         ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
     ),
-    "colours of the object are pure": (("gimp3d.stages.footprint:LEAST_SHARE", 1.0),),
+    "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
     "islands in a chart's hole stay": (("gimp3d.stages.charts:_without_islands", lambda hole, _: hole),),
@@ -97,8 +97,8 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
-    "light differs by as much all round the hole": (("gimp3d.stages.propagate.blend:TOLERANCES", (1.0,)),),
-    "depth seams do not stop the blend": (("gimp3d.stages.propagate.blend:SEAM", 1e9),),
+    "light differs by as much all round the hole": (("gimp3d.stages.propagate:TOLERANCES", (1.0,)),),
+    "depth seams do not stop the blend": (("gimp3d.stages.propagate:SEAM", 1e9),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),
     "colours as seeded": (("seed.corrections", 0),),

@@ -25,7 +25,7 @@ import numpy as np
 from structured import edge_error, structured
 
 from gimp3d.compute.threads import set_thread_count
-from gimp3d.evaluate.metrics import score
+from gimp3d.evaluate import score
 from gimp3d.geometry import bounds
 from gimp3d.io.images import write_png
 from gimp3d.priors.inpaint import inpaint_reference

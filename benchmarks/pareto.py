@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from gimp3d.evaluate.benchmark import telea
+from gimp3d.evaluate import telea
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, render_bytes
 
@@ -97,7 +97,7 @@ def measure(scene: Scene, name: str, settings: RemovalSettings) -> tuple[Row, np
 
     def watched(stage: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
         if stage == "seed":
-            made["target"] = inputs[0].target
+            made["target"] = inputs[3]
         made[stage] = work(*inputs)
         return made[stage]
 

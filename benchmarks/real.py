@@ -20,8 +20,7 @@ from scipy.stats import spearmanr
 from gimp3d.camera import Camera, output_name
 from gimp3d.commands import render_views
 from gimp3d.errors import BadInput
-from gimp3d.evaluate.benchmark import empty_region, score_renders, telea
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import empty_region, psnr, score_renders, telea
 from gimp3d.geometry import SAME_DEPTH, bounds
 from gimp3d.io.images import read_image, read_mask, write_png
 from gimp3d.io.ply import read_ply, write_ply

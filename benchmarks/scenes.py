@@ -18,14 +18,13 @@ from gimp3d.camera import Camera, output_name
 from gimp3d.commands import select_cameras
 from gimp3d.compute.threads import available_cores, set_thread_count
 from gimp3d.errors import BadInput
-from gimp3d.evaluate.benchmark import photo_with_object
-from gimp3d.evaluate.metrics import psnr, score
+from gimp3d.evaluate import photo_with_object, psnr, score
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import read_cameras
 from gimp3d.io.formats import read_scene as read_splats
 from gimp3d.io.images import load_view, read_image, read_mask, write_png
 from gimp3d.pipeline import RemovalResult, RemovalSettings, View, remove_object, render_bytes
-from gimp3d.run import Observer, unobserved
+from gimp3d.run import Observer
 
 MADE = ("desk", "corner", "gloss", "rocks")  # rendered, without shadows
 REAL = ("real_table", "real_bed", "kitchen_monkey", "tiles_mug")
@@ -146,7 +145,7 @@ def removal(
     reference: Camera | None = None,
     picture: np.ndarray | None = None,
     views: Sequence[View] | None = None,
-    observer: Observer = unobserved,
+    observer: Observer | None = None,
     region: Region | None = None,  # where another than the scene's is drawn round the object
 ) -> RemovalResult:
     """A removal of the scene's object with the training or other views; a reference that is none of them is drawn."""

@@ -17,7 +17,6 @@ from gimp3d.camera import Camera
 from gimp3d.errors import IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalResult, View
-from gimp3d.run import unobserved
 
 from .command import ASSETS, parser_of, say, told_in_one_line, write_results
 from .perturbations import exposed, garbled, gathered, misplaced, noisy_depths, noisy_surfaces
@@ -67,7 +66,7 @@ def measured(folder: Path, kind: str, level: float, preset: str) -> Row:
     row: Row = {"scene": scene.name, "kind": kind, "level": level}
     views = perturbed_views(scene, reference, kind, level)
     try:
-        observer = noisy_surfaces(level, SEED) if kind == "surface" else unobserved
+        observer = noisy_surfaces(level, SEED) if kind == "surface" else None
         with noisy_depths(level, SEED) if kind == "depths" else nullcontext():
             result = removal(scene, PRESETS[preset], reference, scene.truth(reference), views, observer=observer)
     except IllPosed as error:

@@ -144,8 +144,9 @@ def _stored(text: str, name: str) -> tuple[Camera, int]:
         stored = json.loads(text)
         viewmat = np.array(stored["viewmat"], np.float64)
         rigid(viewmat, where)  # a check: what is stored keeps its bits
-        distortion = Distortion(*map(float, stored["distortion"])) if stored["distortion"] else None
-        size, lens = (stored["width"], stored["height"]), tuple(stored[k] for k in ("fx", "fy", "cx", "cy"))
+        distortion = Distortion(*map(float, stored["distortion"] or ()))
+        size = int(stored["width"]), int(stored["height"])
+        lens = float(stored["fx"]), float(stored["fy"]), float(stored["cx"]), float(stored["cy"])
         split, image = str(stored["split"]), Path(stored["image"]) if stored["image"] else None
         return make_camera(where, stored["id"], viewmat, size, lens, distortion, split, image), int(stored["number"])
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError, RecursionError):

@@ -17,9 +17,8 @@ import numpy as np
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, Gaussians, sh_basis
-from gimp3d.io.ply import PlyProperty, PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
-from gimp3d.srgb import decoded
+from gimp3d.gaussians import SH_C0, Gaussians, decoded, sh_basis
+from gimp3d.io.ply import PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
 
 from .native import attribute_values, is_native, read_native, write_native
 from .shading import COLOUR, GROUP, RADIUS, node_group, splat_material
@@ -79,12 +78,12 @@ def create_object(name: str, file: SplatFile, matrix: Matrix) -> bpy.types.Objec
     mesh.vertices.add(len(gaussians))
     usable = gaussians.usable
     mesh.vertices.foreach_set("co", np.where(usable[:, None], gaussians.means, 0).ravel())
-    for prop, column in zip(file.table.properties, _columns(records)):
-        _store_raw(mesh, prop, column)
+    for field, column in zip(file.table.properties, _columns(records)):
+        _store_raw(mesh, field, column)
     _store_display(mesh, gaussians, usable)
     table = file.table
     kept = {"header": _vertex_header(table.header), "line_end": table.line_end, "format": table.format}
-    mesh[TABLE] = json.dumps({**kept, "properties": [[p.name, p.type] for p in table.properties]})
+    mesh[TABLE] = json.dumps({**kept, "properties": list(table.properties.items())})
     mesh.materials.append(splat_material())
     obj = bpy.data.objects.new(name, mesh)
     obj.matrix_world, obj[ID] = matrix, uuid.uuid4().hex
@@ -168,15 +167,15 @@ def read_object(obj: bpy.types.Object) -> SplatFile:
 
 def _read_mesh(mesh: bpy.types.Mesh) -> SplatFile:
     stored = json.loads(mesh[TABLE])
-    properties = tuple(PlyProperty(*p) for p in stored["properties"])
+    properties = dict(stored["properties"])
     header = tuple(stored["header"])
     empty = PlyTable(header, stored["line_end"], stored["format"], properties, np.zeros(0, "V1"))
     records = np.empty(len(mesh.vertices), empty.dtype)
-    for group in _groups(properties):
-        columns = [_load_raw(mesh, p, empty.dtype[p.name].newbyteorder("=")) for p in group]
+    for group in _groups(tuple(properties)):
+        columns = [_load_raw(mesh, field, empty.dtype[field].newbyteorder("=")) for field in group]
         for rows in row_blocks(len(records)):
-            for prop, column in zip(group, columns):
-                records[prop.name][rows] = column[rows]
+            for field, column in zip(group, columns):
+                records[field][rows] = column[rows]
     if stored["format"] == "ascii":
         rows = np.empty(len(records), object)
         rows[:] = ascii_rows(records)
@@ -225,19 +224,19 @@ def _words(kind: np.dtype) -> int:
     return -(-kind.itemsize // 4)
 
 
-def _store_raw(mesh: bpy.types.Mesh, prop: PlyProperty, column: np.ndarray) -> None:
+def _store_raw(mesh: bpy.types.Mesh, field: str, column: np.ndarray) -> None:
     """float32 as FLOAT; any other type as INT words of its bytes, as Blender has no doubles."""
     if column.dtype == np.float32:
-        _attribute(mesh, RAW + prop.name, "FLOAT", "value", column)
+        _attribute(mesh, RAW + field, "FLOAT", "value", column)
         return
     words = np.zeros((len(column), 4 * _words(column.dtype)), np.uint8)
     words[:, : column.dtype.itemsize] = np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1)
     for k, word in enumerate(words.view(np.int32).T):
-        _attribute(mesh, f"{RAW}{prop.name}#{k}", "INT", "value", word)
+        _attribute(mesh, f"{RAW}{field}#{k}", "INT", "value", word)
 
 
-def _load_raw(mesh: bpy.types.Mesh, prop: PlyProperty, kind: np.dtype) -> np.ndarray:
-    names = [RAW + prop.name] if kind == np.float32 else [f"{RAW}{prop.name}#{k}" for k in range(_words(kind))]
+def _load_raw(mesh: bpy.types.Mesh, field: str, kind: np.dtype) -> np.ndarray:
+    names = [RAW + field] if kind == np.float32 else [f"{RAW}{field}#{k}" for k in range(_words(kind))]
     if any(n not in mesh.attributes for n in names):
         raise BadInput(f"{mesh.name} has lost its attribute {names[0]}; import the PLY again")
     columns = np.empty((len(mesh.vertices), len(names)), np.float32 if kind == np.float32 else np.int32)

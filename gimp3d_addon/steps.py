@@ -10,7 +10,7 @@ import numpy as np
 
 from gimp3d.box import in_region
 from gimp3d.errors import BadInput
-from gimp3d.forecast import Forecast, forecast_removal
+from gimp3d.progress import Forecast, forecast_removal
 
 from . import bridge, splats
 from .chosen import current_boxes, current_splat, present

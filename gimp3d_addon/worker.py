@@ -22,7 +22,7 @@ from typing import Any
 
 import gimp3d
 from gimp3d.errors import BadInput, Gimp3dError
-from gimp3d.forecast import Clock
+from gimp3d.progress import Clock
 
 # The core's folder comes last on the path: a chosen Python uses its own NumPy, numba and OpenCV. The folder that
 # Blender was started in comes off it, as a user's numpy.py there must not be imported. A job is locked for as long as

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +12,8 @@ import pytest
 from gimp3d.errors import BadInput
 from gimp3d.priors.calls import Call
 from gimp3d.priors.inpaint import inpaint_reference
+from gimp3d.run import ViewState
+from gimp3d.stages.propagate import Reference
 
 
 def scenery(height: int = 120, width: int = 160, seed: int = 0) -> np.ndarray:
@@ -50,3 +55,14 @@ def refuse(message: str, spec: str, image: np.ndarray, hole: np.ndarray, call: C
         inpaint_reference(spec, image, hole, call=call)
     assert "\n" not in str(found.value)
     return str(found.value)
+
+
+def painted_view(
+    name: str, painted: np.ndarray, rules: np.ndarray, reference: np.ndarray, target: np.ndarray
+) -> ViewState:
+    """A view of which is known what was painted, by which rules, and from which reference: picture and its hole."""
+    camera: Any = SimpleNamespace(id=name)
+    masks: Any = SimpleNamespace(camera=camera)
+    best = Reference(camera, reference, np.ones(target.shape, np.float32), target, ~target)
+    exposure: Any = None  # of no interest
+    return ViewState(masks, painted, exposure, painted, painted, masks, rules=rules, best=(1, best))

@@ -15,7 +15,7 @@ from gimp3d.presets import PRESETS, RemovalSettings
 from gimp3d.raster import render_bytes
 from gimp3d.run import Run
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, draw_charts, lay_planes
-from gimp3d.stages.masks import ViewMasks, find_masks
+from gimp3d.stages.masks import find_masks
 from gimp3d.stages.witness import Witness
 
 BLOCK = 0.5  # side of the block, scene units
@@ -89,13 +89,12 @@ def cameras(count: int = 9, width: int = 120, height: int = 90) -> tuple[Camera,
 
 def charts_of(
     planes: Sequence[Plane],
-    views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     settings: ChartSettings = ChartSettings(),
     marked: Sequence[np.ndarray] = (),
 ) -> tuple[Chart, ...]:
     """What photos show at planes round the block."""
-    return draw_charts(lay_planes(planes, views, witnesses, REGION, settings), witnesses, REGION, marked)
+    return draw_charts(lay_planes(planes, witnesses, REGION, settings), witnesses, REGION, marked)
 
 
 def charted(

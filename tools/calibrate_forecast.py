@@ -1,4 +1,4 @@
-"""Measures the constants of core/gimp3d/forecast.py on this machine and writes them there.
+"""Measures the constants of core/gimp3d/progress.py on this machine and writes them there.
 
 The demo scene, also with its Gaussians split and its pictures enlarged, is removed with several presets, each run in a
 process of its own with compiled kernels; what a stage took is fitted by non-negative least squares.
@@ -22,10 +22,10 @@ import numpy as np
 from scipy.optimize import nnls
 
 from benchmarks.large import split
-from gimp3d import forecast
-from gimp3d.forecast import CHARTED, ON_VIEWS, STAGES, STEPS, forecast_removal
+from gimp3d import progress
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.ply import read_ply, write_gaussians
+from gimp3d.progress import CHARTED, ON_VIEWS, STAGES, STEPS, forecast_removal
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "assets" / "demo"
@@ -56,7 +56,7 @@ class Run:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--write", action="store_true", help="put the constants into forecast.py")
+    parser.add_argument("--write", action="store_true", help="put the constants into progress.py")
     parser.add_argument("--check", nargs=2, action="append", default=[], metavar=("FOLDER", "PRESET"))
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="gimp3d-calibrate-") as folder:
@@ -67,9 +67,9 @@ def main() -> None:
         constants = fitted(runs)
         for name, value in constants.items():
             print(f"{name} = {value!r}")
-            setattr(forecast, name, value)
+            setattr(progress, name, value)
         if given.write:
-            write(Path(forecast.__file__), constants)
+            write(Path(progress.__file__), constants)
         for run in (*runs, *(measure(Path(f), preset, work) for f, preset in given.check)):
             told = forecast_removal(round(1e6 * run.millions), run.views, round(1e6 * run.megapixels), run.preset)
             print(
@@ -106,7 +106,7 @@ def measure(folder: Path, preset: str, work: Path) -> Run:
 
 
 def fitted(runs: list[Run]) -> dict[str, Any]:
-    """The constants that forecast.py names, each stage's own."""
+    """The constants that progress.py names, each stage's own."""
     stages = {}
     for name in (*STAGES, "recolour"):
         had = [r for r in runs if name in r.stages and (r.preset in CHARTED or name in ON_VIEWS)]

@@ -7,17 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import pictures
 from .box import Region
 from .gaussians import Gaussians
-from .run import Run
+from .run import Run, ViewState
 from .stages.charts import Chart
 from .stages.exposure import exposures_of, levelled
 from .stages.masks import Masks
 from .steps.behind import (
     NOT_LIT,
     Charted,
-    Found,
     Relit,
     chart_surfaces,
     find_light,
@@ -26,7 +24,6 @@ from .steps.behind import (
     undo_light,
     with_contact,
 )
-from .view_state import ViewState
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
 # stages that know nothing of fills
@@ -48,9 +45,8 @@ class Behind:
     def recoloured(self, kept: Gaussians, rows: np.ndarray) -> Behind:
         """With what stays, of which the rows [M] have other colours now."""
         stays = np.flatnonzero(~self.masks.removed)
-        sh = self.scene.sh.copy()
-        sh[stays[rows]] = kept.sh[rows]
-        return replace(self, scene=replace(self.scene, sh=sh), changed=np.union1d(self.changed, stays[rows]))
+        scene = self.scene.with_rows(stays[rows], kept.take(rows))
+        return replace(self, scene=scene, changed=np.union1d(self.changed, stays[rows]))
 
 
 def look_behind(
@@ -73,15 +69,15 @@ def look_behind(
     surfaces = run("surfaces", find_surfaces, *inputs)
     masks = replace(masks, selection=surfaces.selection)
 
-    def in_light(found: Found, suffix: str = "") -> tuple[Relit, Charted]:
+    def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Charted]:
         """What the object does to the light undone, and the charts as they are then."""
         light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
-        lit = Relit(found, light)
+        lit = replace(found, lifted=light)
         bounded = surfaces if light is None else surfaces.with_marked(light.dark)
         inputs = lit.scene(scene), region, bounded, lit.views(views), settings
         return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
 
-    found = NOT_LIT.found
+    found = NOT_LIT
     if settings.shadow != "off":
         found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
         if isinstance(found.shadow, str) and settings.shadow == "mask":
@@ -90,20 +86,19 @@ def look_behind(
     if isinstance(found.shadow, str) and settings.shadow == "auto":
         found = run("contact", with_contact, found, charted.charts)
         again = not isinstance(found.shadow, str)
-        lit, charted = in_light(found, " 2") if again else (Relit(found, lit.lifted), charted)
+        lit, charted = in_light(found, " 2") if again else (replace(found, lifted=lit.lifted), charted)
     if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
         surfaces = run("surfaces 2", find_surfaces, *inputs, False)
         masks = replace(masks, selection=surfaces.selection)
         lit, charted = in_light(found, " 3")
-    run.pictures += pictures.of_light(lit, [v.id for v in views])
     scene, views = lit.scene(scene), lit.views(views)
     if charted.charts:
-        targets = charted.targets
-        masks = replace(masks, selection=charted.selection, views=targets.views)
-        views = tuple(replace(v, masks=m, left=m, hits=h) for v, m, h in zip(views, targets.views, targets.hits))
+        masks = replace(masks, selection=charted.selection, views=tuple(m for m, _ in charted.targets))
+        views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, charted.targets))
     behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
     if not settings.refine.steps:
         return behind
     given = scene, region, masks.removed, views, charted.charts, settings, run.progress
     learned = run("relearn", relearn, *given)
-    return replace(behind, scene=learned.scene(scene), changed=np.union1d(lit.rows, learned.rows))
+    scene = scene.with_rows(learned.rows, learned.gaussians)
+    return replace(behind, scene=scene, changed=np.union1d(lit.rows, learned.rows))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .errors import BadInput
+from .errors import BadInput, refusing
 from .gaussians import matrices_to_quats, quats_to_matrices
 from .schema import checked, read_json
 
+PARTS = ("center", "size", "rotation_wxyz")  # of a box in a file
 LARGEST_ROI = 1 << 20  # bytes of a ROI's file
 MOST_BOXES = 50
 LARGEST = 1e30  # scene units
@@ -27,14 +28,7 @@ class Box:
 
     @classmethod
     def make(cls, center: object, size: object, rotation_wxyz: object = (1, 0, 0, 0)) -> Box:
-        """A checked box from anything array-like.
-
-        Parameters
-        ----------
-        center, size
-            Three numbers each, in scene units; the size is the length of the edges.
-        rotation_wxyz
-            A quaternion of any length but zero: how the box is turned.
+        """A checked box from anything array-like; a quaternion of any length but zero says how it is turned.
 
         Raises
         ------
@@ -46,10 +40,9 @@ class Box:
         >>> Box.make([0, 0, 0.5], [1, 1, 1]).contains(np.array([[0, 0, 0.9], [0, 0, 1.1]]))
         array([ True, False])
         """
-        try:
+        wrong = (TypeError, ValueError, OverflowError, RecursionError)
+        with refusing("ROI: numbers expected for center, size and rotation_wxyz", *wrong):
             c, s, q = (np.array(v, dtype=np.float64) for v in (center, size, rotation_wxyz))
-        except (TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise BadInput(f"ROI: numbers expected for center, size and rotation_wxyz ({error})") from None
         for name, value, length in (("center", c, 3), ("size", s, 3), ("rotation_wxyz", q, 4)):
             if value.shape != (length,) or not (np.abs(value) < LARGEST).all():  # NaN is not less either
                 raise BadInput(f"ROI: {name} must be {length} finite numbers")
@@ -76,7 +69,7 @@ class Box:
         return self.center + (signs * self.size / 2) @ self.axes.T
 
     def to_json(self) -> dict[str, list[float]]:
-        return {name: getattr(self, name).tolist() for name in ("center", "size", "rotation_wxyz")}
+        return {name: getattr(self, name).tolist() for name in PARTS}
 
 
 Region = tuple[Box, ...]
@@ -114,17 +107,10 @@ def read_region(path: Path | str) -> Region:
         raise BadInput(f"ROI: {path} holds no box")
     if len(boxes) > MOST_BOXES:
         raise BadInput(f"ROI: {path} holds {len(boxes)} boxes; {MOST_BOXES} are the most, each costs time")
+    region = []
     for box in boxes:
-        if not isinstance(box, dict) or not {"center", "size"} <= set(box):
+        if not isinstance(box, dict) or box.get("center") is None or box.get("size") is None:
             raise BadInput(f'ROI: {path} must hold {{"center", "size", "rotation_wxyz"}} or a list of such boxes')
-    read = (checked(_Entry, box, f"ROI: {path}", extra=True) for box in boxes)
-    return tuple(Box.make(b.center, b.size, b.rotation_wxyz) for b in read)
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A box of a ROI file."""
-
-    center: list[float]
-    size: list[float]
-    rotation_wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
+        told = [checked(list[float], box[n], f"ROI: {path}: {n}") for n in PARTS if box.get(n) is not None]
+        region.append(Box.make(*told))
+    return tuple(region)

@@ -29,6 +29,8 @@ from .memory import require_base_memory
 from .progress import count_words
 
 Namespace = argparse.Namespace
+Option = Callable[..., Any]  # a command's add_argument
+Command = Callable[[str, Callable[[Namespace, "Reporter"], None], str], Option]  # adds one: its name, runner and words
 DEPTH_PRIORS = "auto|harmonic|planar|file:PATH|onnx:PATH|torchscript:PATH|command:CMD, then ,disparity|,depth|,metric"
 PAINTERS = "file:PATH|onnx:PATH[,WxH]|torchscript:PATH|gemini[:MODEL]|http://HOST:PORT|command:CMD"
 REFINERS = "asks command:CMD or http://HOST:PORT to refine the painted views, the completed reference beside them"
@@ -48,19 +50,14 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"gimp3d {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
-    def command(name: str, run: Callable[[Namespace, Reporter], None], words: str) -> Callable[..., Any]:
+    def command(name: str, run: Callable[[Namespace, Reporter], None], words: str) -> Option:
         added = commands.add_parser(name, help=words)
         added.set_defaults(run=run)
         return added.add_argument
 
     _scene_commands(command)
-    _remove_command(command)
-    _scoring_commands(command)
+    _removal_commands(command)
     return parser
-
-
-# Adds a command by its name, what runs it and words; returns its add_argument.
-Command = Callable[[str, Callable[[Namespace, "Reporter"], None], str], Callable[..., Any]]
 
 
 def _scene_commands(command: Command) -> None:
@@ -102,7 +99,7 @@ def _scene_commands(command: Command) -> None:
     option("--fov", type=float, default=50.0, metavar="DEG", dest="fov_degrees", help="horizontal")
 
 
-def _remove_command(command: Command) -> None:
+def _removal_commands(command: Command) -> None:
     option = command("remove", _remove, "remove what lies in the region and fill the hole")
     option("scene", nargs="?")
     option("--cameras")
@@ -127,8 +124,6 @@ def _remove_command(command: Command) -> None:
     option("--variants", type=int, default=1, metavar="N", help="N fills to choose from: OUT.ply, OUT.2.ply, …")
     _running(option)
 
-
-def _scoring_commands(command: Command) -> None:
     option = command("evaluate", _evaluate, "score pictures against true ones")
     for name in ("--pred", "--truth", "--masks"):
         option(name, required=True, metavar="DIR", type=Path)
@@ -144,13 +139,13 @@ def _scoring_commands(command: Command) -> None:
     _running(option)
 
 
-def _scene_and_cameras(option: Callable[..., Any]) -> None:
+def _scene_and_cameras(option: Option) -> None:
     option("scene", type=Path)
     option("--cameras", required=True, type=Path, help="transforms.json, COLMAP folder, or cameras.json")
     option("--out", required=True, metavar="DIR", type=Path)
 
 
-def _object(option: Callable[..., Any]) -> None:
+def _object(option: Option) -> None:
     """What goes with the object: options of `masks` and `remove`."""
     shadow = "the object's shadow and reflection: undone where clear, left; or its shadow as --shadow-masks marks it"
     option("--images", metavar="DIR|none", help="photos; none: views are rendered from the scene")
@@ -162,7 +157,7 @@ def _object(option: Callable[..., Any]) -> None:
     option("--depth-prior", metavar="PROVIDER", help=DEPTH_PRIORS)
 
 
-def _running(option: Callable[..., Any]) -> None:
+def _running(option: Option) -> None:
     """How commands that need the kernels are run."""
     option("--threads", type=int, metavar="N", help="default: one per core")
     option("--progress", choices=("bar", "json", "none"), default="bar")
@@ -344,7 +339,7 @@ def _orbit(given: Namespace, _: Reporter) -> None:
 
 
 def _evaluate(given: Namespace, _: Reporter) -> None:
-    from .evaluate.metrics import evaluate_folders
+    from .evaluate import evaluate_folders
 
     scores = evaluate_folders(**_values(given, "json"))
     if given.json:
@@ -358,7 +353,7 @@ def _evaluate(given: Namespace, _: Reporter) -> None:
 
 def _bench(given: Namespace, shown: Reporter) -> None:
     from .compute.threads import set_thread_count
-    from .evaluate.benchmark import run_benchmark, table
+    from .evaluate import run_benchmark, table
     from .pipeline import PRESETS
 
     unknown = [p for p in given.presets if p not in PRESETS]
@@ -370,7 +365,12 @@ def _bench(given: Namespace, shown: Reporter) -> None:
 
 def entry_point() -> None:
     """The `gimp3d` program: a terminated run ends like an interrupted one."""
-    _open_streams()
+    # A standard stream that is closed leads nowhere, so that no file of ours takes its number and gets its text.
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # what matters is said by us, in a line
 
@@ -390,12 +390,3 @@ def entry_point() -> None:
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(code)  # all files are closed; taking the interpreter down piece by piece takes a third of a second
-
-
-def _open_streams() -> None:
-    """A standard stream that is closed leads nowhere, so that no file of ours takes its number and gets its text."""
-    for number in (0, 1, 2):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one

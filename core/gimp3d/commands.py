@@ -29,7 +29,7 @@ from .io.ply import SplatFile, positions, write_gaussians, write_ply
 from .job import MOST_VARIANTS, RemovalJob, SharedStages, StageStore
 from .memory import GAUSSIAN, VIEW_PIXEL, require_memory
 from .orbit import measured_up, orbit_cameras
-from .pictures import draw, of_light
+from .pictures import of_light
 from .pipeline import RemovalResult, RemovalSettings, View, look, preview, remove_object, render_bytes
 from .presets import job_settings, shadow_of
 from .progress import Progress, silent
@@ -38,7 +38,7 @@ from .report import summary_of, write_charts, write_removal_report
 from .run import Run
 from .stages.charts import chart_number
 from .stages.masks import MaskSettings
-from .stages.propagate.blend import to_bytes
+from .stages.propagate import to_bytes
 from .steps.references import charts_to_paint
 
 PASSES = ("rgb", "alpha", "depth", "normal")
@@ -72,7 +72,7 @@ def scene_info(path: Path) -> dict[str, Any]:
         "bounds_min": np.percentile(means, 1, axis=0).round(4).tolist(),
         "bounds_max": np.percentile(means, 99, axis=0).round(4).tolist(),
         "format": file.table.format,
-        "properties": [p.name for p in file.table.properties],
+        "properties": list(file.table.properties),
         "comments": list(file.table.comments),
     }
 
@@ -110,24 +110,15 @@ def render_views(
     scene: Path,
     cameras: Path,
     out: Path,
-    split: str = "all",
+    split: str = "all",  # train | test | all
     frames: Sequence[str] | None = None,
     passes: Sequence[str] = ("rgb",),
-    scale: float = 1.0,
-    background: Sequence[float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,  # of the pictures' width and height
+    background: Sequence[float] = (0.0, 0.0, 0.0),  # red, green, blue from 0 to 1
     threads: int | None = None,
     progress: Progress = silent,
 ) -> None:
     """Draw the scene from its cameras into a folder, as `gimp3d render` does: one file for each frame and pass.
-
-    Parameters
-    ----------
-    split
-        train, test or all.
-    scale
-        Of the pictures' width and height.
-    background
-        Red, green, blue from 0 to 1.
 
     Raises
     ------
@@ -214,7 +205,7 @@ def write_masks(
     seen = {v.id: v for v in behind.views}
     if pictures:
         write_json(pictures / "proposed.json", frame.proposed_back(behind.masks.proposed))
-        write_json(pictures / "light.json", {"shadow": behind.lit.shadow, "reflection": behind.lit.reflection})
+        write_json(pictures / "light.json", behind.lit.facts())
         if all(c.split == "train" for c in written):
             charts = charts_to_paint(behind.charts, behind.views)
             write_charts(pictures / "charts", frame.charts_back(charts))
@@ -224,7 +215,7 @@ def write_masks(
         write_png(out / f"{name}.png", target)
         if pictures and view:
             for looked in (*preview(view, run.settings), *of_light(behind.lit, list(seen), [camera.id])):
-                write_png(pictures / f"{name}.{looked.kind}.png", draw(looked))
+                write_png(pictures / f"{name}.{looked.kind}.png", looked.draw())
 
 
 def write_orbit(
@@ -279,13 +270,6 @@ def run_removal(
     if job.device == "cuda":
         raise BadInput("--device cuda: there is no CUDA backend yet; use cpu or auto")
     settings = job_settings(job)
-    out = Path(job.out)
-    if out.suffix.lower() != ".ply" and not is_stream(out):
-        raise BadInput(f"--out: {out} must end in .ply")
-    if not 1 <= job.variants <= MOST_VARIANTS:
-        raise BadInput(f"--variants must be from 1 to {MOST_VARIANTS}, got {job.variants}")
-    if job.variants > 1 and is_stream(out):
-        raise BadInput(f"--variants: {out} takes one scene only")
     _try_targets(job, folder)
     progress("read", 0, 1, job.scene)
     file = read_scene(Path(job.scene))
@@ -318,33 +302,35 @@ def run_removal(
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
         results.append(remove_object(scene, views, region, of_variant, *given))
     summary = summary_of(job, settings, file, results, warnings, time.perf_counter() - start)
-    _write_beside(job, folder, scene, views, results, summary)
-    for path, result in reversed(list(zip(job.outs(), results))):
-        write_ply(path, file, result.keep, result.added)  # OUT last: as it was until all has gone well
+    if job.report:
+        write_removal_report(Path(job.report), scene, views, results, summary)
+    _write_results(job, folder, file, results, summary)
     return summary
 
 
-def _write_beside(
-    job: RemovalJob,
-    folder: Path | None,
-    scene: Gaussians,
-    views: Sequence[View],
-    variants: Sequence[RemovalResult],
-    summary: dict[str, Any],
+def _write_results(
+    job: RemovalJob, folder: Path | None, file: SplatFile, results: Sequence[RemovalResult], summary: dict[str, Any]
 ) -> None:
-    """What a removal writes beside OUT: views, charts, report, summary."""
+    """Views, charts, summary, and the scenes, OUT last: as it was until all has gone well."""
     if job.views_out:
-        for name, image in variants[0].painted.items():
+        for name, image in results[0].painted.items():
             write_png(Path(job.views_out) / f"{output_name(name)}.png", image)
-        write_charts(Path(job.views_out) / "charts", variants[0].charts)
-    if job.report:
-        write_removal_report(Path(job.report), scene, views, variants, summary)
+        write_charts(Path(job.views_out) / "charts", results[0].charts)
     for path in [p for p in (job.summary, folder and folder / "summary.json") if p]:
         write_json(Path(path), summary)
+    for path, result in reversed(list(zip(job.outs(), results))):
+        write_ply(path, file, result.keep, result.added)
 
 
 def _try_targets(job: RemovalJob, folder: Path | None) -> None:
     """Sweep what killed runs left half-written, and see that everything can be written before the work starts."""
+    out = Path(job.out)
+    if out.suffix.lower() != ".ply" and not is_stream(out):
+        raise BadInput(f"--out: {out} must end in .ply")
+    if not 1 <= job.variants <= MOST_VARIANTS:
+        raise BadInput(f"--variants must be from 1 to {MOST_VARIANTS}, got {job.variants}")
+    if job.variants > 1 and is_stream(out):
+        raise BadInput(f"--variants: {out} takes one scene only")
     files = [*job.outs(), *(Path(p) for p in (job.summary, folder and folder / "summary.json") if p)]
     folders = [Path(p) for p in (job.report, job.views_out, folder and folder / "stages") if p]
     of_variants = folder.glob("stages/*/") if folder else ()

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from .errors import BadInput
+from .errors import BadInput, refusing
 
 UNFINISHED = ".gimp3d-part"  # ends the names of files that are being written
 
@@ -55,7 +55,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     A link is followed and the file's permissions are kept. A pipe or a device is written to as it is. BadInput if the
     folder cannot be written or the disk is full.
     """
-    try:
+    with refusing(f"cannot write {path}", OSError):
         if is_stream(path):
             with path.open("wb") as stream:
                 write(stream)
@@ -79,8 +79,6 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
             with suppress(OSError):
                 os.unlink(name)
             raise
-    except OSError as error:
-        raise BadInput(f"cannot write {path} ({error.strerror or error})") from None
 
 
 def write_json(path: Path, document: Any) -> None:
@@ -90,7 +88,7 @@ def write_json(path: Path, document: Any) -> None:
 
 def try_target(path: Path, is_folder: bool = False) -> None:
     """Raise BadInput now if `path`, or a file in the folder `path`, could not be written later."""
-    try:
+    with refusing(f"cannot write {path}", OSError, ValueError), suppress(FileNotFoundError):
         if is_stream(path):
             if is_folder or not os.access(path, os.W_OK):
                 raise BadInput(f"cannot write {path} (a pipe or device)")
@@ -104,10 +102,6 @@ def try_target(path: Path, is_folder: bool = False) -> None:
         with tempfile.TemporaryFile(prefix=".gimp3d-", dir=place):
             pass
         os.lstat(place / target.name)  # fails where the name is too long
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError) as error:
-        raise BadInput(f"cannot write {path} ({getattr(error, 'strerror', None) or error})") from None
 
 
 def sweep(folders: Iterable[Path]) -> None:

@@ -12,32 +12,17 @@ from . import pictures
 from .errors import IllPosed
 from .gaussians import Gaussians
 from .geometry import SAME_DEPTH
-from .run import Run, counted
-from .stages.charts import Chart
+from .priors.inpaint import painter
+from .run import Run, ViewState, counted, open_pixels
+from .stages.charts import CHART, Chart
 from .stages.propagate import Reference
 from .stages.reference import choose_reference
-from .stages.refine import observed, refine_gaussians
+from .stages.refine import looked_at, observed, refine_gaussians
+from .stages.seed import seed_gaussians, settle_gaussians
+from .steps import references
 from .steps.behind import take_painted_colours
-from .steps.references import (
-    Completed,
-    Turn,
-    after_reference,
-    ask_to_refine,
-    carried_over,
-    complete_view_depth,
-    emptied,
-    left_to_charts,
-    map_reference,
-    paint_chart,
-    paint_view,
-    paint_views,
-    seed_surface,
-    settle_seeds,
-    snapped,
-    texels_to_fill,
-    with_answers,
-)
-from .view_state import ViewState, open_pixels
+from .steps.references import Completed, Turn
+from .steps.view_refinement import refine_views
 
 NEGLIGIBLE = 1e-3  # share of what the object touches in all views; a smaller hole that cannot be filled stays open
 REFINING = 0.5  # share of a painted hole that a refining painter may change (img2img's denoising strength)
@@ -61,7 +46,7 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
     touched = sum(int(v.masks.silhouette.sum()) for v in filling.views)
     if turns[0].chart is not None and turns[0].name and run.settings.depth_prior != "auto":
         run.warnings.append(f"--depth-prior {run.settings.depth_prior} is not used: the reference is a chart")
-    filling = replace(filling, views=emptied(filling.kept, filling.views))
+    filling = replace(filling, views=references.emptied(filling.kept, filling.views))
     for number, turn in enumerate(turns):
         if number and open_pixels(filling.views) < run.settings.extra_gain * hole:
             break
@@ -84,40 +69,39 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
 def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix: str) -> Completed | None:
     """One chart without its hole; None if no view needs it."""
     assert turn.chart is not None
-    chart = carried_over(chart, filling.done)
-    target, hole = texels_to_fill(chart, turn.chart, filling.views)
+    chart = references.carried_over(chart, filling.done)
+    target, hole = references.texels_to_fill(chart, turn.chart, filling.views)
     if not target.any():
         if turn.name:
             run.warnings.append(f"--reference {turn.name}: no view needs this chart, it is not used")
         return None
     name = f"appearance{suffix}"
-    appearance = run(name, paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
+    appearance = run(name, references.paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    return Completed(chart.camera, appearance.image, chart.depth, target, ~target & ~hole & chart.known, (chart,))
+    return Completed(chart.camera, appearance.image, chart.depth, target, ~target & chart.known, (chart,))
 
 
 def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
     """One view without the object, which the program chooses unless the user did; None if charts are filled for it."""
     settings, views, tried = run.settings, filling.views, {c.camera_id for c in run.references}
-    masks = [v.left for v in views]
-    choice = run(f"reference{suffix}", choose_reference, masks, turn.name, tried)
+    choice = run(f"reference{suffix}", choose_reference, [v.left for v in views], turn.name, tried)
     run.references.append(choice)
-    if turn.name and left_to_charts(charts, turn, settings):
+    if turn.name and references.left_to_charts(charts, turn, settings):
         run.warnings.append(f"--reference {turn.name}: without a picture of it, its hole is filled on charts")
         return None
     view = next(v for v in views if v.id == choice.camera_id)
     name, first = f"depth{suffix}", not suffix
     calls = run.call("--inpaint", name), run.call("--depth-prior", name)
-    completion = run(name, complete_view_depth, view, settings, turn.picture, first, *calls)
+    completion = run(name, references.complete_view_depth, view, settings, turn.picture, first, *calls)
     depth = np.where(view.left.target, completion.depth, view.left.depth_after).astype(np.float32)
     # Where drawn surfaces scatter about the charts by more than a z-test allows, the charts tell the depth.
     rough = any(c.scatter > SAME_DEPTH for c in charts)
     if rough and view.hits is not None:
-        depth = snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
+        depth = references.snapped(depth, view.hits.depth, max(c.scatter for c in charts)).astype(np.float32)
     name = f"appearance{suffix}"
-    appearance = run(name, paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
+    appearance = run(name, references.paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    run.pictures += pictures.of_depth(completion, depth, view.left.target, appearance.image, view.id)
+    run.pictures += pictures.of_depth(completion, depth, view.left.target, view.id)
     source = ~view.left.target & ~view.left.silhouette & (depth > 0)
     return Completed(view.camera, appearance.image, depth, view.left.target, source, charts if rough else ())
 
@@ -125,21 +109,22 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
 def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
     """A completed reference in every view, and the Gaussians that show it."""
     settings, views, filled = run.settings, filling.views, filling.kept.extended(filling.added)
-    seeds = run(f"seed{suffix}", seed_surface, completed, filled.is_surfels, settings, words=counted)
+    camera, of_seeds = completed.camera, settings.seed
+    surface = completed.image, completed.depth, completed.target, filled.is_surfels, of_seeds, camera.split == CHART
+    seeds = run(f"seed{suffix}", seed_gaussians, camera, *surface, words=counted)
     if len(seeds) == 0:
-        name = completed.camera.id
-        raise IllPosed(f"reference {name}: what is behind the object is infinitely far; nothing to build")
+        raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
     sampled = settings.propagate.transfer == "sample"
-    field_ = run(f"mapping{suffix}", map_reference, completed, views, settings) if sampled else None
-    with_seeds = filled.extended(seeds)
-    name = f"propagate{suffix}"
-    painting = run(name, paint_views, completed, field_, views, with_seeds, settings, run.progress)
+    field_ = run(f"mapping{suffix}", references.map_reference, completed, views, settings) if sampled else None
+    inputs = completed, field_, views, filled.extended(seeds), settings, run.progress
+    painting = run(f"propagate{suffix}", references.paint_views, *inputs)
     run.pictures += pictures.of_reference(completed, field_)
     run.pictures += pictures.of_painting(painting, views)
-    new = run(f"settle{suffix}", settle_seeds, completed, seeds, filled, views, painting, settings, words=counted)
+    given = filled, seeds, completed.camera, painting.views, settings.seed
+    new = run(f"settle{suffix}", settle_gaussians, *given, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
-    views = after_reference(views, painting.views, completed, filled, new, len(added))
+    views = references.after_reference(views, painting.views, completed, filled, new, len(added))
     return replace(filling, views=views, added=added, done=(*filling.done, completed))
 
 
@@ -147,12 +132,14 @@ def ask_for_refinement(run: Run, filling: Filling) -> Filling:
     """The painted views, refined by a painter that sees their reference beside them if the user asked for one."""
     if not run.settings.refine_views:
         return filling
-    call = run.call("--refine-views", "refine views", REFINING)
-    asked = run(call.stage, ask_to_refine, filling.views, run.settings, call)
+    call, settings = run.call("--refine-views", "refine views", REFINING), run.settings
+    who = painter(settings.refine_views, call)
+    views = looked_at([v for v in filling.views if v.best is not None], settings.refine)
+    asked = run(call.stage, refine_views, who, views, settings.random_seed, call)
     run.warnings += asked.warnings
     run.pictures += pictures.of_refinement(asked, filling.views)
-    facts = {"provider": run.settings.refine_views, **asked.facts()}
-    return replace(filling, views=with_answers(filling.views, asked), asked=facts)
+    facts = {"provider": settings.refine_views, **asked.facts()}
+    return replace(filling, views=asked.applied(filling.views), asked=facts)
 
 
 def refine(run: Run, filling: Filling) -> Filling:
@@ -171,4 +158,4 @@ def recolour(run: Run, filling: Filling) -> Filling:
     if filling.added is None or run.settings.charts is None or not run.settings.refine.steps:
         return filling
     found = run("recolour", take_painted_colours, filling.kept, filling.added, filling.views)
-    return replace(filling, kept=found.scene(filling.kept), recoloured=found.rows)
+    return replace(filling, kept=filling.kept.with_rows(found.rows, found.gaussians), recoloured=found.rows)

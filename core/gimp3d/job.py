@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from .errors import BadInput
+from .errors import BadInput, refusing
 from .files import require_file, user_secret, user_state_folder, write_atomically
 from .schema import SETTING, Between, checked, kinds, parse_json
 
@@ -95,10 +94,8 @@ class RemovalJob:
 
 def save_job(folder: Path, job: RemovalJob) -> None:
     """Write `folder`/job.json (atomically), making the folder if needed, and remember that this user wrote it."""
-    try:
+    with refusing(f"job: cannot make the folder {folder}", OSError):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"job: cannot make the folder {folder} ({error.strerror})") from None
     # The mark makes the file's content one that nobody else can have written, see _record.
     document = {"version": JOB_VERSION, "mark": secrets.token_hex(16), **asdict(job.relative_to(folder))}
     text = json.dumps(document, indent=1).encode()
@@ -120,10 +117,8 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
     one that is damaged or of another version, or one that reaches out.
     """
     path, given = folder / "job.json", given or {}
-    try:
+    with refusing(f"job: {folder} holds no job.json; give SCENE, --cameras, --roi and --out", OSError):
         text = require_file(path).read_bytes()
-    except OSError:
-        raise BadInput(f"job: {folder} holds no job.json; give SCENE, --cameras, --roi and --out") from None
     try:
         document: dict[str, Any] = checked(dict[str, Any], parse_json(text, str(path), LARGEST_JOB), str(path))
     except BadInput as error:
@@ -145,15 +140,14 @@ def load_job(folder: Path, given: Mapping[str, Any] | None = None, allow_command
 
 def _refuse_reaching_out(job: RemovalJob, folder: Path, given: Mapping[str, Any], own: bool) -> None:
     """Raise BadInput if a job names what it did not bring, and neither did the user, nor wrote it so themselves."""
-    path, root = folder / "job.json", folder.resolve()
+    root = folder.resolve()
     written = {"stages", "summary.json", *(getattr(job, n) for n in WRITTEN if n not in given)}
-    for link in _links_out(folder, root):
-        place = link.relative_to(folder)
-        if not own or any(place.is_relative_to(w) for w in written if w):
+    for link in (p for p in folder.rglob("*") if p.is_symlink() and not _lies_in(root, p)):  # links are not followed
+        if not own or any(link.relative_to(folder).is_relative_to(w) for w in written if w):
             raise BadInput(f"job: {link} is a link that leads out of the folder; take it away")
     if own:
         return
-    stranger = f"job: {path} was not written by you on this machine, and"
+    stranger = f"job: {folder / 'job.json'} was not written by you on this machine, and"
     for name in job.PATHS:
         value, option = getattr(job, name), "SCENE" if name == "scene" else f"--{name.replace('_', '-')}"
         if name not in given and value not in (None, "none") and not _lies_in(root, folder / value):
@@ -171,14 +165,6 @@ def _named_providers(job: RemovalJob, given: Mapping[str, Any]) -> Iterator[tupl
             yield name, getattr(job, name) or ""
         if "set" not in given:
             yield name, job.set.get(name, "")
-
-
-def _links_out(folder: Path, root: Path) -> Iterator[Path]:
-    for place, folders, files in os.walk(folder):  # links are not followed
-        for name in (*folders, *files):
-            path = Path(place, name)
-            if path.is_symlink() and not _lies_in(root, path):
-                yield path
 
 
 def _lies_in(root: Path, path: Path) -> bool:
@@ -215,11 +201,9 @@ class StageStore:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {k: file[k] for k in file.files}
             document = json.loads(bytes(arrays.pop("document")).decode())
-            if document["key"] != self.key or document["settings"] != self.settings:
-                return None
-            if not hmac.compare_digest(document["checksum"], self._checksum(document["result"], arrays)):
-                return None
-            return self._decode(document["result"], arrays)
+            result, fits = document["result"], (document["key"], document["settings"]) == (self.key, self.settings)
+            ours = fits and hmac.compare_digest(document["checksum"], self._checksum(result, arrays))
+            return self._decode(result, arrays) if ours else None
         except Exception:  # empty, damaged, somebody else's, of an older version: whatever it is, the stage runs again
             return None
 

@@ -25,18 +25,13 @@ def orbit_cameras(
     region: Sequence[Box],
     count: int = 24,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    width: int = 960,
+    width: int = 960,  # pixels
     height: int = 540,
     fov_degrees: float = 50.0,  # horizontal
 ) -> tuple[Camera, ...]:
     """Cameras that look at a region's centre from rings above it, IDs orbit/000, orbit/001 …
 
-    Parameters
-    ----------
-    up
-        A direction in the scene, of any length; the rings stand round it.
-    width, height
-        Of the pictures, pixels.
+    The rings stand round `up`, a direction in the scene of any length.
 
     Raises
     ------

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,19 +13,18 @@ from .compute.threads import parallel_map
 from .gaussians import Gaussians
 from .geometry import disparity_of, window_mask
 from .raster import footprint, touched_window
-from .run import Picture
+from .run import Picture, ViewState
 from .stages.charts import Chart
-from .stages.mapping import MappingField
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
+from .stages.propagate.paper import MappingField
 from .stages.reference import DepthCompletion
-from .stages.view_refinement import ViewRefinement
+from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed
-from .view_state import ViewState
+from .steps.view_refinement import ViewRefinement
 
-T = TypeVar("T")
-SPREAD = 3  # views that are shown of many
+FEW = 3  # views that are shown of many
 SHOWN = 0.25  # blend weight of what the boxes cut off from which a pixel is marked
 RULE_COLOURS = {
     Rule.EVIDENCE: ("seen in this photo", (70, 160, 90)),
@@ -34,20 +34,17 @@ RULE_COLOURS = {
     Rule.REFERENCE: ("warped from the reference", (240, 170, 50)),
     Rule.UNREACHED: ("not reached by this reference", (220, 60, 60)),
 }
+RED = (230, 60, 60)
 PLOT_LOW, PLOT_HIGH = 56, 424  # px between which a plot of 480 px has its axes
 
 
-def spread(items: Sequence[T]) -> list[T]:
-    """A few of many, evenly."""
-    return [items[k * len(items) // SPREAD] for k in range(min(SPREAD, len(items)))]
-
-
 def of_targets(views: Sequence[ViewState]) -> list[Picture]:
-    return [Picture("mask", f"Region to fill in {v.id}", v.photo, (v.left.target,)) for v in spread(views)]
+    few = spread(views, FEW)
+    return [Picture("mask", f"Region to fill in {v.id}", partial(tinted, v.photo, v.left.target)) for v in few]
 
 
 def of_charts(charts: Sequence[Chart]) -> list[Picture]:
-    return [Picture("chart", f"What photos show of {c.camera.id}", c.image, (c.hole,)) for c in charts]
+    return [Picture("chart", f"What photos show of {c.camera.id}", partial(tinted, c.image, c.hole)) for c in charts]
 
 
 def of_growth(scene: Gaussians, masks: Masks, views: Sequence[ViewState]) -> list[Picture]:
@@ -62,7 +59,7 @@ def of_growth(scene: Gaussians, masks: Masks, views: Sequence[ViewState]) -> lis
         return footprint(scene, v.camera, rows, pixels=window) > SHOWN
 
     most = sorted(zip(views, parallel_map(shown, views)), key=lambda pair: -int(pair[1].sum()))[:2]
-    return [Picture("mask", f"{title}, in {v.id}", v.photo, (mask,)) for v, mask in most]
+    return [Picture("mask", f"{title}, in {v.id}", partial(tinted, v.photo, mask)) for v, mask in most]
 
 
 def of_light(lit: Relit, camera_ids: Sequence[str], shown: Sequence[str] | None = None) -> list[Picture]:
@@ -73,75 +70,63 @@ def of_light(lit: Relit, camera_ids: Sequence[str], shown: Sequence[str] | None 
     order = sorted(range(len(camera_ids)), key=lambda k: -int(lifted.shaded[k].sum()))[:2]
     if shown is not None:
         order = [k for k, name in enumerate(camera_ids) if name in shown]
-    what = [name for name, facts in (("shadow", lit.shadow), ("reflection", lit.reflection)) if facts["found"]]
+    what = [name for name, facts in lit.facts().items() if facts["found"]]
     title = f"The object's {' and '.join(what)} in {{}}: photo, what is left alone, undone"
-    return [
-        Picture("shadow", title.format(camera_ids[k]), lifted.before[k], (lifted.light[k], lifted.photos[k]))
-        for k in order
-        if lifted.shaded[k].any()
-    ]
+    parts = {k: [lifted.before[k], np.dstack([lifted.light[k]] * 3), lifted.photos[k]] for k in order}
+    changed = [k for k in order if lifted.shaded[k].any()]
+    return [Picture("shadow", title.format(camera_ids[k]), partial(np.hstack, parts[k])) for k in changed]
 
 
-def of_depth(
-    completion: DepthCompletion, depth: np.ndarray, target: np.ndarray, image: np.ndarray, name: str
-) -> list[Picture]:
+def of_depth(completion: DepthCompletion, depth: np.ndarray, target: np.ndarray, name: str) -> list[Picture]:
     """The completed surface, and how the depth prior was scaled, if there was one."""
-    shown = [Picture("depth", f"Completed surface in {name}", image, (depth, target))]
-    if len(completion.fit.ring):
-        data = (completion.fit.ring, np.array(completion.fit.line), np.array([completion.fit.scale]))
-        shown.append(Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", image, data))
+    shown, fit = [Picture("depth", f"Completed surface in {name}", partial(relief, depth, target))], completion.fit
+    if len(fit.ring):
+        plot = partial(fit_plot, fit.ring, fit.line, fit.scale)
+        shown.append(Picture("fit", f"Scale of the depth prior, measured round the hole of {name}", plot))
     return shown
 
 
 def of_reference(completed: Completed, field: MappingField | None) -> list[Picture]:
     image, name = completed.image, completed.camera.id
-    shown = [Picture("appearance", f"The reference without the object, {name}", image, (completed.target,))]
+    outline = partial(outlined, image, completed.target)
+    shown = [Picture("appearance", f"The reference without the object, {name}", outline)]
     if field is not None:
-        shown.append(Picture("mapping", f"Mapping field of {name}", image, (field.rows, field.cols)))
+        offsets = partial(offset_colours, image, field.rows, field.cols)
+        shown.append(Picture("mapping", f"Mapping field of {name}", offsets))
     return shown
 
 
 def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Picture]:
     """Filled views: raw, blended, and by which rule."""
     before, shown = {v.id: v.painted for v in views}, []
-    for p in spread(painting.views):
-        was, title = before[p.camera_id], f"Filled view {p.camera_id}"
-        shown.append(Picture("rules", title, p.pasted(was), (p.rule_map(*was.shape[:2]), p.pasted(was, p.raw))))
+    for p in spread(painting.views, FEW):
+        was = before[p.camera.id]
+        maps = p.pasted(was), p.rule_map(), p.pasted(was, p.raw)
+        shown.append(Picture("rules", f"Filled view {p.camera.id}", partial(by_rule, *maps)))
     return shown
 
 
 def of_refinement(asked: ViewRefinement, views: Sequence[ViewState]) -> list[Picture]:
     before = {v.id: v.painted for v in views}
     shown = [
-        Picture("refined", f"{a.camera_id} refined: before, after", a.image, (before[a.camera_id],))
+        Picture("refined", f"{a.camera_id} refined: before, after", partial(np.hstack, [before[a.camera_id], a.image]))
         for a in asked.views
         if a.image is not None
     ]
-    return spread(shown)
+    return spread(shown, FEW)
 
 
-def draw(picture: Picture) -> np.ndarray:
-    """A stage's result as a picture, [H, W, 3] uint8."""
-    image, data = picture.image, picture.data
-    if picture.kind in ("mask", "chart"):
-        return tinted(image, data[0], (230, 60, 60))
-    if picture.kind == "shadow":
-        return np.hstack([image, np.repeat(data[0][..., None], 3, axis=2), data[1]])
-    if picture.kind == "refined":
-        return np.hstack([data[0], image])
-    if picture.kind == "rules":
-        marked = image
-        for rule, (_, colour) in RULE_COLOURS.items():
-            marked = tinted(marked, data[0] == rule, colour, 0.35)
-        return np.hstack([data[1], image, marked])
-    if picture.kind == "mapping":
-        return offset_colours(image, *data)
-    if picture.kind == "depth":
-        return relief(*data)
-    return fit_plot(*data) if picture.kind == "fit" else outlined(image, data[0])
+def by_rule(image: np.ndarray, rules: np.ndarray, raw: np.ndarray) -> np.ndarray:
+    """A filled view raw, blended, and with the colours of its rules [H, W] over it."""
+    marked = image
+    for rule, (_, colour) in RULE_COLOURS.items():
+        marked = tinted(marked, rules == rule, colour, 0.35)
+    return np.hstack([raw, image, marked])
 
 
-def tinted(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int], strength: float = 0.5) -> np.ndarray:
+def tinted(
+    image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int] = RED, strength: float = 0.5
+) -> np.ndarray:
     """The image [H, W, 3] uint8 with a colour laid over the mask [H, W] bool."""
     mixed = (1 - strength) * image + strength * np.array(colour)
     return np.where(mask[..., None], mixed, image).astype(np.uint8)
@@ -150,7 +135,7 @@ def tinted(image: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int], st
 def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The image with the mask's outline drawn on it."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(image.copy(), contours, -1, (230, 60, 60), 1)
+    return cv2.drawContours(image.copy(), contours, -1, RED, 1)
 
 
 def relief(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -181,15 +166,15 @@ class FitAxes(NamedTuple):
         share = (points - self.first) / (self.last - self.first)
         return PLOT_LOW + (PLOT_HIGH - PLOT_LOW) * np.stack([share[..., 0], 1 - share[..., 1]], -1)
 
-    def line(self, line: np.ndarray) -> np.ndarray:
+    def line(self, line: tuple[float, float]) -> np.ndarray:
         """Pixels [2, 2] of the ends of the line disparity = slope · prior + offset."""
         return self.place(np.array([(m, line[0] * m + line[1]) for m in (self.first[0], self.last[0])]))
 
 
 def fit_plot(
     ring: np.ndarray,  # [N, 2] (prior, scene's disparity) of pixels round the hole
-    line: np.ndarray,  # [2] (slope, offset) fitted to them
-    scale: np.ndarray,  # s_f, one number: the slope as far as the prior is believed; 0 = it is not used
+    line: tuple[float, float],  # (slope, offset) fitted to them
+    scale: float,  # s_f: the slope as far as the prior is believed; 0 = it is not used
 ) -> np.ndarray:
     """How s_f was measured: the scene's disparity over the prior, and the line fitted; [size, size, 3] uint8."""
     ink, faint, dots, drawn_line = (31, 35, 40), (223, 227, 232), (94, 85, 163), (198, 81, 2)
@@ -215,8 +200,8 @@ def fit_plot(
         seen, start, end = cv2.clipLine((low, low, high - low + 1, high - low + 1), start, end)
         if seen:
             cv2.line(drawn, start, end, drawn_line, 2, cv2.LINE_AA)
-    words = f"s_f = {float(scale.ravel()[0]):.3g}" if scale.any() else "s_f = 0: not used"
-    write(f"{words} (fitted {float(line[0]):.3g})", low, 24, 0.55, drawn_line, 2)
+    words = f"s_f = {scale:.3g}" if scale else "s_f = 0: not used"
+    write(f"{words} (fitted {line[0]:.3g})", low, 24, 0.55, drawn_line, 2)
     write("prior", (low + high) // 2 - 16, high + 44, 0.45)
     write("disparity of the scene", 6, 46, 0.45)
     return drawn

@@ -18,15 +18,16 @@ from .frame import Frame, frame_of
 from .gaussians import Gaussians
 from .presets import PRESETS, RemovalSettings
 from .priors.inpaint import check_provider, painter
-from .priors.monodepth import check_depth_prior
+from .priors.monodepth import depth_provider
 from .progress import Progress, silent
 from .raster import render_bytes
-from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, unobserved
-from .stages.masks import Masks, find_masks
+from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels
+from .stages.masks import find_masks
 from .stages.verdict import Verdict, judge
-from .steps.behind import NOT_LIT, Relit
+from .steps.behind import (
+    Relit,
+)
 from .steps.references import charts_to_paint, complete_view_depth, turns_of
-from .view_state import ViewState, open_pixels
 
 __all__ = [
     "PRESETS", "Picture", "RemovalResult", "RemovalSettings", "StageReport", "View", "look", "preview",
@@ -47,7 +48,7 @@ def remove_object(
     extra_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, filled too: shadows, reflections
     shadow_masks: Mapping[str, np.ndarray] | None = None,  # ID → [H, W] bool, for shadow="mask": its shadow
     allow_network: bool = False,  # whether providers may send pictures off this machine
-    observer: Observer = unobserved,  # runs each stage: to watch it, or to replace it
+    observer: Observer | None = None,  # runs each stage: to watch it, or to replace it
 ) -> RemovalResult:
     """Remove what lies in the region and fill what it hid: the stages of docs/method.md, in their order.
 
@@ -111,8 +112,8 @@ def look(
         settings = replace(settings, mode="paper")
     masks = run("masks", find_masks, scene, region, cameras, settings, run.progress, photos, extra_masks)
     run.warnings += masks.warnings
-    if masks.removed.any() and masks.left_out:
-        run.warnings.append(f"{len(masks.left_out)} views do not frame the region or lie inside it: not used")
+    if masks.removed.any() and (left_out := len(cameras) - len(masks.views)):
+        run.warnings.append(f"{left_out} views do not frame the region or lie inside it: not used")
     return look_behind(run, scene, region, masks, photos, shadow_masks)
 
 
@@ -123,9 +124,10 @@ def _filled(
     settings, masks = run.settings, behind.masks
     if not masks.removed.any():
         run.warnings.append("nothing to remove: the region holds no Gaussian")
-        return _result(run, masks, NOT_LIT)
+        return _result(run, behind)
     to_paint = charts_to_paint(behind.charts, behind.views)
     turns = turns_of(reference, reference_image, behind.charts, settings)
+    run.pictures += pictures.of_light(behind.lit, [v.id for v in behind.views])
     run.pictures += pictures.of_charts(to_paint)
     run.pictures += pictures.of_growth(behind.scene, masks, behind.views)
     run.pictures += pictures.of_targets(behind.views)
@@ -148,36 +150,27 @@ def _filled(
     by_picture = reference_image is not None or settings.inpaint.startswith("file:")
     verdict = _judge(run, views, behind, filling, by_picture)
     completed = {r.camera.id: r.image for r in filling.done}
-    result = _result(
+    return _result(
         run,
-        masks,
-        behind.lit,
-        added=filling.added,
+        behind,
+        filling.added,
         open_pixels=left,
         painted=_painted(filling, behind.lit) if masks.hole_pixels else {},
         charts=tuple(replace(c, image=completed.get(c.camera.id, c.image)) for c in to_paint),
         verdict=verdict,
         refined_views=filling.asked,
     )
-    return _with_changed(result, behind)
 
 
 def _judge(run: Run, views: Sequence[View], behind: Behind, filling: Filling, by_picture: bool) -> Verdict | None:
     """How good the result probably is; a reference whose picture was given is what it is held against."""
-    return run(
-        "verdict",
-        judge,
-        behind.before,
-        filling.kept.extended(filling.added),
-        behind.masks.views,
-        [v.left.target for v in filling.views],
-        {v.id: v.bare for v in filling.views},
-        {v.camera.id for v in views if v.is_photo},
-        behind.charts,
-        {v.id: v.hits for v in filling.views if v.hits is not None},
-        filling.done[0] if filling.done and by_picture else None,
-        words=lambda v: (v.score, "; ".join(v.words)) if v else (1.0, "no view shows the object"),
-    )
+    photos, photographed = {v.id: v.bare for v in filling.views}, {v.camera.id for v in views if v.is_photo}
+    hits = {v.id: v.hits for v in filling.views if v.hits is not None}
+    given = filling.done[0] if filling.done and by_picture else None
+    final, still_open = filling.kept.extended(filling.added), [v.left.target for v in filling.views]
+    inputs = behind.before, final, behind.masks.views, still_open, photos, photographed, behind.charts, hits, given
+    nothing = 1.0, "no view shows the object"
+    return run("verdict", judge, *inputs, words=lambda v: (v.score, "; ".join(v.words)) if v else nothing)
 
 
 def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> list[str]:
@@ -187,7 +180,7 @@ def provider_notices(settings: RemovalSettings, allow_network: bool = False) -> 
     """
     run = Run(settings, silent, allow_network=allow_network)
     notices = [check_provider(settings.inpaint, run.call("--inpaint", "read"))]
-    check_depth_prior(settings.depth_prior, run.call("--depth-prior", "read"))
+    depth_provider(settings.depth_prior, run.call("--depth-prior", "read"))
     if settings.refine_views:
         if not settings.refine.steps:
             raise BadInput("--refine-views: this preset does no refinement that would use them; use balanced or best")
@@ -201,27 +194,21 @@ def _painted(filling: Filling, lit: Relit) -> dict[str, np.ndarray]:
     """ID → the view's photo, at its own exposure, with what the removal changed of it."""
 
     def finished(number: int) -> np.ndarray:
-        v = filling.views[number]
-        return v.exposure.back(v.painted, v.photo, v.masks.silhouette | v.masks.target | lit.shaded(number))
+        v, shaded = filling.views[number], lit.lifted.shaded[number] if lit.lifted else False
+        return v.exposure.back(v.painted, v.photo, v.masks.silhouette | v.masks.target | shaded)
 
     return dict(zip((v.id for v in filling.views), parallel_map(finished, range(len(filling.views)))))
 
 
-def _with_changed(result: RemovalResult, behind: Behind) -> RemovalResult:
-    """The result with the Gaussians that stay, but not as they were: they count as removed and added."""
-    changed = np.zeros(len(result.keep), bool)
-    changed[behind.changed] = True
-    changed &= result.keep  # some were taken away since
-    if not changed.any():
-        return result
-    added = behind.scene.take(changed).extended(result.added)
-    return replace(result, keep=result.keep & ~changed, added=added, changed=int(changed.sum()))
-
-
-def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: Any) -> RemovalResult:
+    """What stays, but not as it was, counts as removed and added."""
+    masks, lit, keep = behind.masks, behind.lit, ~behind.masks.removed
+    changed = np.intersect1d(behind.changed, np.flatnonzero(keep))  # some were taken away since
+    lifted = int(keep[lit.rows].sum())
+    keep[changed] = False
     return RemovalResult(
-        keep=~masks.removed,
-        added=added,
+        keep=keep,
+        added=behind.scene.take(changed).extended(added) if len(changed) else added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
         views=len(masks.views),
@@ -230,9 +217,9 @@ def _result(run: Run, masks: Masks, lit: Relit, added: Gaussians | None = None, 
         warnings=tuple(run.warnings),
         selection=masks.selection.counts,
         proposed=masks.proposed,
-        shadow=lit.shadow,
-        reflection=lit.reflection,
-        lifted=int((~masks.removed)[lit.rows].sum()),
+        lifted=lifted,
+        changed=len(changed),
+        **lit.facts(),
         **more,
     )
 
@@ -248,5 +235,5 @@ def preview(view: ViewState, settings: RemovalSettings) -> list[Picture]:
         except IllPosed:
             return shown  # the region is worth seeing all the more
         depth = np.where(target, completed.depth, view.left.depth_after).astype(np.float32)
-        shown += pictures.of_depth(completed, depth, target, view.photo, view.id)
+        shown += pictures.of_depth(completed, depth, target, view.id)
     return shown

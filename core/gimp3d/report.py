@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numpy as np
 
@@ -21,24 +21,16 @@ from .io.images import write_png
 from .io.ply import SplatFile
 from .job import RemovalJob
 from .memory import peak_memory_mb
-from .pictures import RULE_COLOURS, draw
+from .pictures import RULE_COLOURS
 from .presets import RemovalSettings
 from .progress import count_words
 from .raster import render_bytes
 from .run import RemovalResult, View
 from .stages.charts import Chart
 from .stages.reference import ReferenceChoice
+from .stages.verdict import Verdict
+from .stages.witness import spread
 
-MEANINGS = {  # of the verdict's figures
-    "open_share": "share of the hole that stays open",
-    "remains": "share of the object's pixels that still look like it",
-    "haze": "blend weight before the surface behind the object",
-    "ring_fidelity": "dB that the surroundings gained or lost against photos",
-    "sharpness": "detail of what was filled over that of its surroundings",
-    "agreement": "share of the object's pixels that look as photos, or other views, show the place",
-    "invented": "share of the object's pixels that no photo and no picture shows",
-    "expected_error": "dB by which the object's pixels are probably worse than its surroundings were",
-}
 MOST_FLIPS = 24  # painted views in the flip-book
 MOST_SCORES = 6  # views listed for each reference
 STYLE = """
@@ -158,40 +150,36 @@ def write_removal_report(
     result, frame = variants[0], frame_of(scene, [v.camera for v in views])
     after = scene.take(result.keep).extended(result.added)
 
-    def write_drawn(name: str, gaussians: Gaussians, view: View) -> None:
-        write_png(folder / name, render_bytes(frame.scene(gaussians), frame.camera(view.camera)))
+    def drawn(gaussians: Gaussians, view: View) -> np.ndarray:
+        return render_bytes(frame.scene(gaussians), frame.camera(view.camera))
+
+    def image(name: str, picture: np.ndarray, words: str = "") -> str:
+        write_png(folder / name, picture)
+        return f"<img src='{name}' alt='{words}'>"
 
     parts: dict[str, list[str]] = {"pairs": [], "flips": [], "pictures": [], "variants": []}
-    for k, view in enumerate(views[n * len(views) // 6] for n in range(min(6, len(views)))):
-        for name, gaussians in (("before", scene), ("after", after)):
-            write_drawn(f"{name}_{k}.png", gaussians, view)
-        pair = f"<div class=flip>{_image(f'before_{k}.png', 'before')}{_image(f'after_{k}.png', 'after')}</div>"
+    for k, view in enumerate(spread(views, 6)):
+        before = image(f"before_{k}.png", drawn(scene, view), "before")
+        pair = f"<div class=flip>{before}{image(f'after_{k}.png', drawn(after, view), 'after')}</div>"
         parts["pairs"].append(_figure(pair, f"{view.camera.id} – hover to see it without the object"))
     painted = list(result.painted.items())
-    for k, (camera_id, image) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
-        write_png(folder / f"view_{k:02d}.png", image)
-        parts["flips"].append(_figure(_image(f"view_{k:02d}.png"), camera_id, " hidden" if k else ""))
+    for k, (camera_id, picture) in enumerate(painted[:: max(1, -(-len(painted) // MOST_FLIPS))]):
+        parts["flips"].append(_figure(image(f"view_{k:02d}.png", picture), camera_id, " hidden" if k else ""))
     if len(variants) > 1:
-        view = max(views, key=lambda v: _touched(v, result))
+        touched = [int((result.painted.get(v.camera.id, v.image) != v.image).sum()) for v in views]
+        view = views[int(np.argmax(touched))]
         for k, variant in enumerate(variants, 1):
-            write_drawn(f"variant_{k}.png", scene.take(variant.keep).extended(variant.added), view)
-            parts["variants"].append(_figure(_image(f"variant_{k}.png"), summary["variants"][k - 1]["out"]))
+            picture = drawn(scene.take(variant.keep).extended(variant.added), view)
+            parts["variants"].append(_figure(image(f"variant_{k}.png", picture), summary["variants"][k - 1]["out"]))
     write_charts(folder / "charts", result.charts)
-    for number, picture in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
-        write_png(folder / f"chart_{number}.png", draw(picture))
-    for k, picture in enumerate(p for p in result.pictures if p.kind != "chart"):
-        write_png(folder / f"stage_{k:02d}.png", draw(picture))
-        wide = " class=wide" if picture.kind in ("rules", "shadow", "refined") else ""
-        parts["pictures"].append(_figure(_image(f"stage_{k:02d}.png"), picture.title, wide))
+    for number, shown in enumerate((p for p in result.pictures if p.kind == "chart"), 1):
+        write_png(folder / f"chart_{number}.png", shown.draw())
+    for k, shown in enumerate(p for p in result.pictures if p.kind != "chart"):
+        wide = " class=wide" if shown.kind in ("rules", "shadow", "refined") else ""
+        parts["pictures"].append(_figure(image(f"stage_{k:02d}.png", shown.draw()), shown.title, wide))
     page = _page(summary, parts, result)
     write_atomically(folder / "index.html", lambda f: f.write(page.encode()))
     return folder / "index.html"
-
-
-def _touched(view: View, result: RemovalResult) -> int:
-    """How many values of the view the removal changed."""
-    painted = result.painted.get(view.camera.id)
-    return 0 if painted is None else int((painted != view.image).sum())
 
 
 def write_charts(folder: Path, charts: Sequence[Chart]) -> None:
@@ -257,17 +245,17 @@ def _figure(content: str, caption: str, attributes: str = "") -> str:
     return f"<figure{attributes}>{content}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def _image(name: str, words: str = "") -> str:
-    return f"<img src='{name}' alt='{words}'>"
-
-
 def _verdict(verdict: dict[str, Any] | None) -> str:
     """The score as a bar from red to green, what it comes to, and its figures."""
     if verdict is None:
         return ""
     score, words = verdict["score"], [escape(w) for w in verdict["words"]]
     bar = f"<div><div style='width:{score:.0%};background:hsl({120 * score:.0f} 60% 45%)'></div></div>"
-    figures = ((n.replace("_", " "), f"{verdict[n]:.3f}", m) for n, m in MEANINGS.items() if verdict[n] is not None)
+    figures = (
+        (name.replace("_", " "), f"{verdict[name]:.3f}", kind.__metadata__[0])
+        for name, kind in get_type_hints(Verdict, include_extras=True).items()
+        if get_origin(kind) is Annotated and verdict[name] is not None
+    )
     return (
         f"<p class=score>{bar}<b>{score:.2f}</b>{words[0]}</p><ul>{''.join(f'<li>{w}</li>' for w in words[1:])}</ul>"
         f"<details><summary>What the score is made of</summary>{_table('.n.', figures)}</details>"
@@ -288,8 +276,8 @@ def _charts(charts: Sequence[Chart], summary: dict[str, Any]) -> str:
     for k, (chart, facts) in enumerate(zip(charts, summary.get("charts", ())), 1):
         numbers = (f"{facts['texels']:,}", f"{facts['hole_texels']:,}", f"{facts['photos_median']:.0f}")
         rows.append((f"chart:{k}", facts["kind"], *numbers, chart.reason))
-        figures += _figure(_image(f"chart_{k}.png", "hole"), f"chart:{k}, what photos show; red: the hole")
-        figures += _figure(_image(f"charts/{k}.png", "completed"), f"chart:{k}, completed")
+        figures += _figure(f"<img src='chart_{k}.png' alt='hole'>", f"chart:{k}, what photos show; red: the hole")
+        figures += _figure(f"<img src='charts/{k}.png' alt='completed'>", f"chart:{k}, completed")
     table = _table("..nnn.", rows, ("chart", "kind", "texels", "hole", "photos of a texel", "why"))
     words = "The surfaces behind the object, straight on. To paint one:"
     code = "<code>--reference chart:N --reference-image FILE</code>"

@@ -1,9 +1,9 @@
-"""What goes into a removal and comes out, and how its stages are run: timed, kept, and open to whoever watches."""
+"""What goes into a removal, travels through it and comes out; how its stages are run: timed, kept, open to watchers."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
@@ -14,7 +14,10 @@ from .gaussians import Gaussians
 from .presets import RemovalSettings
 from .priors.calls import Call
 from .progress import Progress, silent
-from .stages.charts import Chart
+from .stages.charts import Chart, Hits
+from .stages.exposure import Exposure
+from .stages.masks import ViewMasks
+from .stages.propagate import Reference
 from .stages.reference import ReferenceChoice
 from .stages.verdict import Verdict
 
@@ -31,6 +34,40 @@ class View:
 
 
 @dataclass(frozen=True)
+class ViewState:
+    """What is known of a view on its way through a removal; pictures are [H, W] of its camera."""
+
+    masks: ViewMasks  # what the object touched, and where the view has to be filled
+    photo: np.ndarray  # [H, W, 3] uint8, with the object, as it came
+    exposure: Exposure  # of the photo over the splats'
+    bare: np.ndarray  # [H, W, 3] uint8, the photo at the splats' exposure, the object's shadow and reflection undone
+    painted: np.ndarray  # [H, W, 3] uint8, the same without the object, as far as that is known
+    left: ViewMasks  # the masks as they are now: T shrinks with every reference
+    hits: Hits | None = None  # where its rays meet charts; None without them
+    rules: np.ndarray | None = None  # [H, W] Rule that gave each pixel its last colour; None: nothing was painted yet
+    best: tuple[int, Reference] | None = None  # the reference that painted most of it, and how many pixels it did
+
+    @classmethod
+    def first(cls, masks: ViewMasks, photo: np.ndarray, exposure: Exposure) -> ViewState:
+        """A view of which nothing is known but its photo and what has to be filled of it."""
+        level = exposure.level(photo)
+        return cls(masks, photo, exposure, level, level, masks)
+
+    @property
+    def camera(self) -> Camera:
+        return self.masks.camera
+
+    @property
+    def id(self) -> str:
+        return self.masks.camera.id
+
+
+def open_pixels(views: Sequence[ViewState]) -> int:
+    """What is still to be filled, in all views."""
+    return sum(int(v.left.target.sum()) for v in views)
+
+
+@dataclass(frozen=True)
 class StageReport:
     """What a stage says of itself."""
 
@@ -42,14 +79,11 @@ class StageReport:
 
 @dataclass(frozen=True)
 class Picture:
-    """A stage's result to look at; `report` draws it by its kind."""
+    """A stage's result to look at."""
 
     kind: str  # mask | chart | shadow | depth | fit | appearance | mapping | rules | refined
     title: str
-    image: np.ndarray  # [H, W, 3] uint8, the view
-    # per kind: (target) | (hole) | (light that arrives, lifted) | (depth, target) | (ring, line, s_f) | (target)
-    # | (rows, cols) | (rules, raw) | (the view before)
-    data: tuple[np.ndarray, ...]
+    draw: Callable[[], np.ndarray]  # [H, W, 3] uint8, where somebody looks
 
 
 @dataclass(frozen=True)
@@ -85,18 +119,9 @@ class Store(Protocol):
     def save(self, name: str, result: Any) -> None: ...
 
 
-class Observer(Protocol):
-    """Runs a stage: may look at what goes in and comes out, or do something else in its place.
-
-    `name` is the stage's ("masks", "propagate 2" in the second round), `work` its function, `inputs` what that takes.
-    """
-
-    def __call__(self, name: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any: ...
-
-
-def unobserved(name: str, work: Callable[..., Any], inputs: tuple[Any, ...]) -> Any:
-    """The observer that only runs the stage."""
-    return work(*inputs)
+# Runs a stage by its name ("masks", "propagate 2" in the second round), its function and what that takes: may look at
+# what goes in and comes out, or do something else in its place.
+Observer = Callable[[str, Callable[..., Any], tuple[Any, ...]], Any]
 
 
 def counted(new: Gaussians) -> tuple[float, str]:
@@ -112,7 +137,7 @@ class Run:
     progress: Progress = silent
     store: Store | None = None
     allow_network: bool = False
-    observer: Observer = unobserved
+    observer: Observer | None = None
     stages: list[StageReport] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
@@ -128,9 +153,9 @@ class Run:
         """The stage's result."""
         self.progress(name, 0, 1)
         start = time.perf_counter()
-        result = self.store.load(name) if self.store else None
+        result: Any = self.store.load(name) if self.store else None
         if result is None:
-            result = self.observer(name, work, inputs)
+            result = self.observer(name, work, inputs) if self.observer else work(*inputs)
             if self.store:
                 self.store.save(name, result)
         confidence, reason = words(result) if words else (result.confidence, result.reason)

@@ -16,7 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from .errors import BadInput
+from .errors import BadInput, refusing
+from .files import require_file
 
 T = TypeVar("T")
 LARGEST_JSON = 256 << 20  # bytes; a camera takes about 1 kB
@@ -48,26 +49,16 @@ PLAIN: dict[type, str] = {list: "a list", dict: "a mapping", bool: "true or fals
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> Any:
     """A JSON file's document; BadInput if it cannot be read, is too large, or is no JSON that anybody could mean."""
-    try:
-        if not path.is_file() and path.exists():
-            raise BadInput(f"{what}: {path} is not a file")
-        with path.open("rb") as file:
-            text = file.read(largest + 1)
-    except OSError as error:
-        raise BadInput(f"{what}: cannot read {path} ({error.strerror})") from None
-    return parse_json(text, f"{what}: {path}", largest)
+    with refusing(f"{what}: cannot read {path}", OSError), require_file(path).open("rb") as file:
+        return parse_json(file.read(largest + 1), f"{what}: {path}", largest)
 
 
 def parse_json(text: bytes, where: str, largest: int = LARGEST_JSON) -> Any:
     """The document of a JSON text; raises as read_json does."""
     if len(text) > largest:
         raise BadInput(f"{where} is larger than {largest >> 20} MiB")
-    try:
+    with refusing(f"{where} is not JSON", ValueError, RecursionError):
         return json.loads(text.decode("utf-8-sig"))
-    except ValueError as error:
-        raise BadInput(f"{where} is not JSON ({error})") from None
-    except RecursionError:
-        raise BadInput(f"{where} is not JSON (nested too deep)") from None
 
 
 def checked(

@@ -11,9 +11,8 @@ from bpy.props import BoolProperty, IntProperty, StringProperty
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput, Gimp3dError
-from gimp3d.forecast import Clock
 from gimp3d.io.ply import read_ply
-from gimp3d.progress import count_words
+from gimp3d.progress import Clock, count_words
 
 from .. import charts, jobs, splats, steps
 from ..chosen import current_boxes, current_splat, present

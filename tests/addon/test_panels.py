@@ -16,10 +16,10 @@ from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Quaternion
 from scenes import REGION, cameras, scene
 
-from gimp3d.forecast import Clock, forecast_removal
 from gimp3d.gaussians import Gaussians
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.ply import write_gaussians
+from gimp3d.progress import Clock, forecast_removal
 from gimp3d_addon import bridge, classes_of, jobs, panels, steps
 from gimp3d_addon.operators.base import RunsChild
 from gimp3d_addon.worker import Worker, duration

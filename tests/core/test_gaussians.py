@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gimp3d.gaussians import Gaussians, pad_sh
+from gimp3d.gaussians import ARRAYS, Gaussians, pad_sh
 
 
 def test_rows_that_cannot_be_drawn_are_marked(block_scene: Gaussians) -> None:
@@ -20,6 +20,15 @@ def test_rows_that_cannot_be_drawn_are_marked(block_scene: Gaussians) -> None:
     g.log_scales[7, 2] = 200  # overflows
     assert g.usable.tolist() == [False, False, True, True, False, False, False, False]
     assert g.opacity[2] == 1 and g.scales[3, 0] == 0
+
+
+def test_rows_are_replaced_and_the_others_stay(block_scene: Gaussians) -> None:
+    rows = np.array([5, 2])
+    changed = block_scene.with_rows(rows, block_scene.take(np.array([0, 1])))
+    for name in ARRAYS:
+        before, after = getattr(block_scene, name), getattr(changed, name)
+        np.testing.assert_array_equal(after[rows], before[:2])
+        np.testing.assert_array_equal(np.delete(after, rows, 0), np.delete(before, rows, 0))
 
 
 def test_joining_pads_the_lower_sh_degree(block_scene: Gaussians) -> None:

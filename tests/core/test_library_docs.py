@@ -17,7 +17,7 @@ from scenes import REGION, cameras, scene
 
 from gimp3d.box import Box
 from gimp3d.commands import render_views, run_removal, scene_info
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.frame import frame_of
 from gimp3d.io.cameras import read_cameras, write_transforms
 from gimp3d.io.images import load_view, write_png

@@ -10,10 +10,10 @@ import pytest
 from scenes import REGION, cameras, scene
 
 from gimp3d.errors import BadInput
-from gimp3d.forecast import forecast_removal
 from gimp3d.frame import Frame
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
+from gimp3d.progress import forecast_removal
 
 IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "contact", "appearance", "seed", "propagate", "settle"]
 

@@ -22,6 +22,7 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
+from gimp3d.steps import references
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +133,9 @@ def test_a_job_runs_alone_moves_and_resumes(
         monkeypatch.setattr(pipeline, stage, again)
     for stage in ("exposures_of", "find_surfaces", "find_light", "chart_surfaces"):
         monkeypatch.setattr(behind, stage, again)
-    for stage in ("paint_chart", "seed_surface", "paint_views", "settle_seeds", "refine_gaussians"):
+    for stage in ("paint_chart", "paint_views"):
+        monkeypatch.setattr(references, stage, again)
+    for stage in ("seed_gaussians", "settle_gaussians", "refine_gaussians"):
         monkeypatch.setattr(filling, stage, again)
     run("remove", "--job", moved, "--resume", "--progress", "none")
     assert (moved / "out.ply").read_bytes() == first

@@ -10,7 +10,7 @@ from scenes import REGION, cameras, charted, scene
 
 from gimp3d import filling
 from gimp3d.errors import IllPosed
-from gimp3d.evaluate.benchmark import run_benchmark
+from gimp3d.evaluate import run_benchmark
 from gimp3d.pipeline import PRESETS, RemovalSettings, View, remove_object, render_bytes
 
 

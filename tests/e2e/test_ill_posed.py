@@ -32,8 +32,8 @@ from gimp3d.io.cameras import write_transforms
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import footprint, render
-from gimp3d.stages.mapping import mapping_field
 from gimp3d.stages.masks import find_masks
+from gimp3d.stages.propagate.paper import mapping_field
 from gimp3d.stages.reference import choose_reference
 
 UP = np.array([0, 0, 1.0])
@@ -538,7 +538,7 @@ def test_a_crashed_run_goes_on_where_it_was(remove: Remove, monkeypatch: pytest.
     (folder / "summary.json").unlink()
     old_result(folder)
     job = folder.parent / "job"
-    crash = "import os, gimp3d.filling as f; f.paint_views = lambda *a, **b: os._exit(9)"
+    crash = "import os, gimp3d.steps.references as f; f.paint_views = lambda *a, **b: os._exit(9)"
     assert in_a_child(folder, crash, ("--job", job)).returncode == 9
     assert_as_before(folder)
     monkeypatch.setattr(pipeline, "find_masks", again)

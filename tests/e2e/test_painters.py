@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from onnx_files import combined, model, pixelwise
-from pictures import disc, holed, scenery
+from pictures import disc, holed, painted_view, scenery
 from scenes import REGION, cameras, scene
 from stand_ins import Automatic, Comfy, Gemini, StandIn, big_lama, depth_model, serving
 
@@ -29,7 +29,7 @@ from gimp3d.priors.inpaint import inpaint_reference, painter
 from gimp3d.priors.monodepth import depth_prior
 from gimp3d.stages.propagate import Rule
 from gimp3d.stages.refine import PAINTED
-from gimp3d.stages.view_refinement import ViewToRefine, refine_views
+from gimp3d.steps.view_refinement import refine_views
 
 PAGE = (Path(__file__).parents[2] / "docs" / "painters.md").read_text(encoding="utf-8")
 PRINTED = [
@@ -97,9 +97,9 @@ def asks_only(scene_: Any, views: Any, region: Any, settings: RemovalSettings, *
     call = Call("--inpaint", "appearance", rest[2], 60, network, settings.prompt)
     facts["inpaint"] = inpaint_reference(settings.inpaint, holed(picture, hole), hole, call=call).reason
     if settings.depth_prior != "auto":
-        assert depth_prior(settings.depth_prior, *hole.shape, picture, call) is not None
+        assert depth_prior(settings.depth_prior, *hole.shape, lambda: picture, call) is not None
     if settings.refine_views:
-        view = ViewToRefine("a", picture, np.where(hole, Rule.REFERENCE, Rule.UNTOUCHED), picture, hole)
+        view = painted_view("a", picture, np.where(hole, Rule.REFERENCE, Rule.UNTOUCHED), picture, hole)
         done = refine_views(painter(settings.refine_views, call), [view], 0, call)
         facts["refined"] = done.facts()
     return RemovalResult(np.ones(len(scene_), bool), None, refined_views=facts)
@@ -185,17 +185,17 @@ def test_painted_and_refined_views_reach_the_splats(tmp_path: Path, monkeypatch:
     refine = written(folder, "refine.py", body)
     before: dict[str, np.ndarray] = {}
     seen: dict[str, Any] = {}  # by ID, what the splats are fitted to
-    ask, fit = filling.ask_to_refine, filling.refine_gaussians
+    ask, fit = filling.refine_views, filling.refine_gaussians
 
-    def asked(views: Any, *rest: Any) -> Any:
+    def asked(who: Any, views: Any, *rest: Any) -> Any:
         before.update({v.id: v.painted.astype(int) for v in views})
-        return ask(views, *rest)
+        return ask(who, views, *rest)
 
     def fitted(kept: Any, added: Any, views: Any, *rest: Any) -> Any:
         seen.update({v.camera.id: v for v in views})
         return fit(kept, added, views, *rest)
 
-    monkeypatch.setattr(filling, "ask_to_refine", asked)
+    monkeypatch.setattr(filling, "refine_views", asked)
     monkeypatch.setattr(filling, "refine_gaussians", fitted)
     few = ("--set", "refine.steps=2", "--inpaint", paint, "--report", str(folder / "report"))
     assert remove(folder, *few, "--refine-views", refine) == 0

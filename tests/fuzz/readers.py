@@ -238,8 +238,12 @@ def read_answers(data: bytes) -> object:
     if "error" in document:
         return _said(data)
     values = {"prompt": "", "negative": "", "seed": 0, "strength": 1, "checkpoint": ""}
-    painting = _Comfy(Answers(document), None) if document.pop("comfy", False) else _Automatic(Answers(document))
-    painting.words()
+    painting = (
+        _Comfy(Answers(document), _workflow(servers.SHIPPED, "x"))
+        if document.pop("comfy", False)
+        else _Automatic(Answers(document))
+    )
+    assert painting.doing
     return painting.paint(np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), bool), values)
 
 

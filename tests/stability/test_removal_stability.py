@@ -24,9 +24,9 @@ from benchmarks.perturbations import exposed, garbled, gathered, misplaced, nois
 from benchmarks.scenes import filled, mean_psnrs, read_scene, removal
 from benchmarks.stability import draw, perturbed_views, report
 from gimp3d.camera import Camera
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.pipeline import PRESETS, RemovalResult, View, remove_object, render_bytes
-from gimp3d.run import Observer, unobserved
+from gimp3d.run import Observer
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE, *OTHERS = cameras(9)
@@ -39,7 +39,7 @@ DIAGONAL = float(np.linalg.norm(REGION[0].size))
 def removed(
     views: tuple[Camera, ...] = ALL,
     photos: dict[str, np.ndarray] | None = None,
-    observer: Observer = unobserved,
+    observer: Observer | None = None,
 ) -> RemovalResult:
     """The block removed, the reference's true picture given."""
     photos = photos or {c.id: render_bytes(scene(), c) for c in views}

@@ -18,7 +18,7 @@ from gimp3d.cli import main
 from gimp3d.gaussians import Gaussians, matrices_to_quats, quats_to_matrices
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
-from gimp3d.io.ply import PlyProperty, SplatFile, file_of, new_rows, write_ply
+from gimp3d.io.ply import SplatFile, file_of, new_rows, write_ply
 from gimp3d.pipeline import render_bytes
 
 SIZE = 3.2  # of the scene
@@ -94,9 +94,7 @@ class Moved:
 
 def as_file(gaussians: Gaussians, double: bool) -> SplatFile:
     file = file_of(replace(gaussians, means=gaussians.means.astype(np.float32)))
-    properties = tuple(
-        PlyProperty(p.name, "double" if double and p.name in "xyz" else "float") for p in file.table.properties
-    )
+    properties = {n: "double" if double and n in "xyz" else "float" for n in file.table.properties}
     header = tuple(
         h.replace("float", "double")
         if double and h in ("property float x", "property float y", "property float z")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,21 +32,20 @@ REFUSED = {  # camera models that have no pinhole picture
     "orthographic": "ORTHOGRAPHIC|ORTHOPHOTO",
 }
 PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-COLMAP_MODELS = {  # in the order of their numbers in cameras.bin; the parameters of each, ? where they are not read
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+COLMAP_MODELS = {  # in the order of their numbers in cameras.bin; each one's parameters as _Entry names them, ? unread
+    "SIMPLE_PINHOLE": "fl_x cx cy",
+    "PINHOLE": "fl_x fl_y cx cy",
+    "SIMPLE_RADIAL": "fl_x cx cy k1",
+    "RADIAL": "fl_x cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "OPENCV_FISHEYE": "? ? ? ? ? ? ? ?",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
     "FOV": "? ? ? ? ?",
     "SIMPLE_RADIAL_FISHEYE": "? ? ? ?",
     "RADIAL_FISHEYE": "? ? ? ? ?",
     "THIN_PRISM_FISHEYE": "? ? ? ? ? ? ? ? ? ? ? ?",
 }
 COLMAP_DAMAGE = (struct.error, ValueError, IndexError, KeyError, OverflowError)
-Lens = tuple[float, float, float, float]  # fx, fy, cx, cy, px
 ColmapLens = tuple[str, int, int, list[float]]  # model, width, height, parameters
 Pose = tuple[str, int, list[float], list[float]]  # name, number of the lens, quaternion wxyz, translation
 
@@ -72,13 +71,13 @@ def read_cameras(
     """
     path = Path(path)
     if path.is_dir():
-        cameras = _read_colmap(path, images)
+        cameras = tuple(sorted(_read_colmap(path, images), key=lambda c: c.id))
     else:
         document = read_json(path, "cameras")
         if isinstance(document, dict) and isinstance(document.get("frames"), list):
-            cameras = _read_transforms(path, document, images)
+            cameras = tuple(_read_transforms(path, document, images or path.parent))
         elif isinstance(document, list) and document and isinstance(document[0], dict) and "rotation" in document[0]:
-            cameras = _read_inria(path, document, images)
+            cameras = tuple(_read_inria(path, document, images or path.parent))
         else:
             raise BadInput(f"{path} holds no cameras: a transforms.json, cameras.json or COLMAP folder expected")
     if not cameras:
@@ -176,18 +175,14 @@ def make_camera(
     where: str,
     name: Any,
     viewmat: np.ndarray,
-    size: tuple[Any, Any],
-    intrinsics: tuple[Any, Any, Any, Any],  # fx, fy, cx, cy
-    distortion: Distortion | None = None,
-    split: str = "train",
-    image: Path | None = None,
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],  # fx, fy, cx, cy
+    distortion: Distortion,
+    split: str,
+    image: Path | None,
 ) -> Camera:
     """A checked Camera; raises BadInput if a size, focal length or principal point makes no sense."""
-    try:
-        width, height = (int(v) for v in size)
-        fx, fy, cx, cy = (float(v) for v in intrinsics)
-    except (TypeError, ValueError, OverflowError):
-        raise BadInput(f"{where}: numbers expected for size, focal length and principal point") from None
+    (width, height), (fx, fy, cx, cy) = size, intrinsics
     if not 0 < width <= LARGEST_SIDE or not 0 < height <= LARGEST_SIDE or width * height > LARGEST_PICTURE:
         raise BadInput(f"{where}: an image of {shown(width)}×{shown(height)} pixels makes no sense")
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
@@ -196,11 +191,10 @@ def make_camera(
         raise BadInput(
             f"{where}: no lens has focal lengths {fx:g} and {fy:g} and centre {cx:g}, {cy:g} ({width} px wide)"
         )
-    if distortion is not None and not np.isfinite(distortion.coefficients).all():
+    if not np.isfinite(distortion.coefficients).all():
         raise BadInput(f"{where}: the distortion coefficients are not finite")
-    if distortion is not None and not distortion.coefficients.any():
-        distortion = None
-    return Camera(camera_id(name, where), width, height, fx, fy, cx, cy, viewmat, split, image, distortion)
+    bent = distortion if distortion.coefficients.any() else None
+    return Camera(camera_id(name, where), width, height, fx, fy, cx, cy, viewmat, split, image, bent)
 
 
 def refuse_model(model: str, where: str) -> None:
@@ -211,8 +205,8 @@ def refuse_model(model: str, where: str) -> None:
 
 
 @dataclass(frozen=True)
-class _Frame(Distortion):
-    """A frame of a transforms.json, with what the document says of all of them."""
+class _Entry(Distortion):
+    """A camera as its file tells it, in nerfstudio's names; of a transforms.json with what that says of all frames."""
 
     file_path: Any = None
     transform_matrix: list[list[float]] | None = None
@@ -232,53 +226,43 @@ class _Frame(Distortion):
     split: Literal["train", "test"] = "train"
 
 
-def _read_transforms(path: Path, document: dict[str, Any], images: Path | None) -> tuple[Camera, ...]:
-    cameras = []
-    of_all = {key: v for key, v in document.items() if key != "frames"}
-    for k, entry in enumerate(document["frames"]):
-        where = f"{path}, frame {k}"
-        if not isinstance(entry, dict) or entry.get("transform_matrix") is None:
-            raise BadInput(f"{where}: no transform_matrix")
-        frame: _Frame = checked(_Frame, {**of_all, **entry}, where, extra=True)
-        name = camera_id(frame.file_path, where)
-        refuse_model(frame.camera_model, where)
-        if frame.is_fisheye:
-            refuse_model("FISHEYE", where)
-        photo = _photo(images or path.parent, name)
-        size, intrinsics = _transforms_intrinsics(frame, photo, where)
-        extra = [k for k in ("k4", "k5", "k6") if getattr(frame, k)]
-        if extra:
-            raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
-        viewmat = _inverted(rigid(frame.transform_matrix, where) @ OPENGL_TO_OPENCV)
-        viewmat = _exactly(viewmat, frame.world_to_camera)
-        distortion = Distortion(frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
-        cameras.append(make_camera(where, name, viewmat, size, intrinsics, distortion, frame.split, photo))
-    return tuple(cameras)
-
-
-def _exactly(viewmat: np.ndarray, told: Any) -> np.ndarray:
-    """The view matrix as `write_transforms` told it, unless another program has changed the pose since."""
-    exact = _numbers(told)
-    same = exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max())
-    return exact if same else viewmat
-
-
-def _transforms_intrinsics(frame: _Frame, photo: Path, where: str) -> tuple[tuple[int, int], Lens]:
-    width, height, fx = frame.w, frame.h, frame.fl_x
+def _camera(entry: _Entry, where: str, viewmat: np.ndarray, photos: Path) -> Camera:
+    """The camera that an entry tells of, with what it leaves out: a lens looks straight ahead, a photo has the size."""
+    name = camera_id(entry.file_path, where)
+    photo = _photo(photos, name)
+    width, height, fx = entry.w, entry.h, entry.fl_x
     if width is None or height is None:
         from .images import read_image  # needs OpenCV, which files that name their size do without
 
         if not photo.exists():
             raise BadInput(f"{where}: no image size (w, h) and no photo {photo} to take it from")
         height, width = read_image(photo).shape[:2]
-    if fx is None and frame.camera_angle_x is not None:
-        angle = checked(LensAngle, frame.camera_angle_x, f"{where}: camera_angle_x")
+    if fx is None and entry.camera_angle_x is not None:
+        angle = checked(LensAngle, entry.camera_angle_x, f"{where}: camera_angle_x")
         fx = 0.5 * width / math.tan(0.5 * angle)
     if fx is None:
         raise BadInput(f"{where}: no focal length (fl_x or camera_angle_x)")
-    fy = fx if frame.fl_y is None else frame.fl_y
-    cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
-    return (width, height), (fx, fy, cx, cy)
+    fy = fx if entry.fl_y is None else entry.fl_y
+    cx, cy = width / 2 if entry.cx is None else entry.cx, height / 2 if entry.cy is None else entry.cy
+    if extra := [k for k in ("k4", "k5", "k6") if getattr(entry, k)]:
+        raise BadInput(f"{where}: distortion coefficients {', '.join(extra)} are not supported; undistort first")
+    distortion = Distortion(entry.k1, entry.k2, entry.p1, entry.p2, entry.k3)
+    return make_camera(where, name, viewmat, (width, height), (fx, fy, cx, cy), distortion, entry.split, photo)
+
+
+def _read_transforms(path: Path, document: dict[str, Any], photos: Path) -> Iterator[Camera]:
+    of_all = {key: v for key, v in document.items() if key != "frames"}
+    for k, given in enumerate(document["frames"]):
+        where = f"{path}, frame {k}"
+        if not isinstance(given, dict) or given.get("transform_matrix") is None:
+            raise BadInput(f"{where}: no transform_matrix")
+        entry: _Entry = checked(_Entry, {**of_all, **given}, where, extra=True)
+        refuse_model("FISHEYE" if entry.is_fisheye else entry.camera_model, where)
+        viewmat = _inverted(rigid(entry.transform_matrix, where) @ OPENGL_TO_OPENCV)
+        exact = _numbers(entry.world_to_camera)
+        if exact.shape == (4, 4) and np.abs(exact - viewmat).max() <= 1e-12 * (1 + np.abs(viewmat).max()):
+            viewmat = exact  # as `write_transforms` told it; another program has not changed the pose since
+        yield _camera(entry, where, viewmat, photos)
 
 
 def _photo(folder: Path, name: str) -> Path:
@@ -293,7 +277,7 @@ def _photo(folder: Path, name: str) -> Path:
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _InriaEntry:
     """A camera of Inria's cameras.json."""
 
     img_name: Any
@@ -305,35 +289,31 @@ class _Entry:
     height: int
 
 
-def _read_inria(path: Path, document: list[Any], images: Path | None) -> tuple[Camera, ...]:
-    cameras = []
+def _read_inria(path: Path, document: list[Any], photos: Path) -> Iterator[Camera]:
     for k, given in enumerate(document):
         where = f"{path}, camera {k}"
-        entry: _Entry = checked(_Entry, given, where, extra=True)
+        entry: _InriaEntry = checked(_InriaEntry, given, where, extra=True)
         rotation, position = _numbers(entry.rotation), _numbers(entry.position)
         if rotation.shape != (3, 3) or position.shape != (3,):
             raise BadInput(f"{where}: rotation must be 3×3 and position 3 numbers")
-        name = camera_id(entry.img_name, where)
         viewmat = _inverted(rigid(np.column_stack([rotation, position]), where))
-        intrinsics = entry.fx, entry.fy, entry.width / 2, entry.height / 2
-        photo = _photo(images or path.parent, name)
-        cameras.append(make_camera(where, name, viewmat, (entry.width, entry.height), intrinsics, image=photo))
-    return tuple(cameras)
+        told = _Entry(file_path=entry.img_name, w=entry.width, h=entry.height, fl_x=entry.fx, fl_y=entry.fy)
+        yield _camera(told, where, viewmat, photos)
 
 
-def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
-    model = next((m for m in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0") if _is_model(m)), None)
-    if model is None:
+def _read_colmap(folder: Path, images: Path | None) -> Iterator[Camera]:
+    places = (folder, folder / "sparse" / "0", folder / "sparse", folder / "0")
+    models = ((p / f"cameras{e}", p / f"images{e}") for p in places for e in (".bin", ".txt"))
+    found = next((m for m in models if m[0].exists() and m[1].exists()), None)
+    if found is None:
         raise BadInput(f"{folder} holds no COLMAP model (cameras and images, .bin or .txt)")
-    binary = (model / "images.bin").exists()
+    model, binary = found[0].parent, found[0].suffix == ".bin"
     read_lenses, read_poses = (_lenses_bin, _poses_bin) if binary else (_lenses_txt, _poses_txt)
     damaged = refusing(f"the COLMAP model in {model} is damaged", *COLMAP_DAMAGE)
     with damaged, refusing(f"cannot read the COLMAP model in {model}", OSError):
-        lenses, poses = read_lenses(model), read_poses(model)
-    if images is None:
-        near = (place / "images" for place in (folder, folder.parent, folder.parent.parent))
-        images = next((f for f in near if f.is_dir()), folder)
-    cameras = []
+        lenses, poses = read_lenses(found[0]), read_poses(found[1])
+    near = (place / "images" for place in (folder, folder.parent, folder.parent.parent))
+    photos = images or next((f for f in near if f.is_dir()), folder)
     for number, (given, lens, quat, translation) in enumerate(poses):
         name = camera_id(given, f"{model}, image {number}")
         where = f"{model}, image {name}"
@@ -341,30 +321,17 @@ def _read_colmap(folder: Path, images: Path | None) -> tuple[Camera, ...]:
             raise BadInput(f"{where}: its camera {lens} is not in the model")
         kind, width, height, parameters = lenses[lens]
         refuse_model(kind, where)
-        intrinsics, distortion = _colmap_intrinsics(kind, parameters, where)
+        names = COLMAP_MODELS.get(kind, "?").split()
+        if "?" in names:
+            raise BadInput(f"{where}: the camera model {kind} is not supported; undistort the photos to a pinhole")
+        if len(parameters) < len(names):
+            raise BadInput(f"{where}: the camera model {kind} has too few parameters")
         if not np.isfinite([*quat, *translation]).all() or np.linalg.norm(quat) < 1e-9:
             raise BadInput(f"{where}: the pose is not finite")
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = quats_to_matrices(np.array([quat]))[0], translation
-        size = width, height
-        cameras.append(make_camera(where, name, viewmat, size, intrinsics, distortion, image=images / name))
-    return tuple(sorted(cameras, key=lambda c: c.id))
-
-
-def _is_model(folder: Path) -> bool:
-    return any((folder / f"cameras{e}").exists() and (folder / f"images{e}").exists() for e in (".bin", ".txt"))
-
-
-def _colmap_intrinsics(kind: str, parameters: Sequence[float], where: str) -> tuple[Lens, Distortion | None]:
-    names = COLMAP_MODELS.get(kind, "?").split()
-    p = dict(zip(names, parameters))
-    if "?" in names or any(p.get(k) for k in ("k4", "k5", "k6")):
-        raise BadInput(f"{where}: the camera model {kind} is not supported; undistort the photos to a pinhole")
-    if not set(names) - {"k4", "k5", "k6"} <= set(p):
-        raise BadInput(f"{where}: the camera model {kind} has too few parameters")
-    fx, fy = (p["f"], p["f"]) if "f" in p else (p["fx"], p["fy"])
-    coefficients = {k: v for k, v in p.items() if k in ("k1", "k2", "p1", "p2", "k3")}
-    return (fx, fy, p["cx"], p["cy"]), Distortion(**coefficients) if coefficients else None
+        told: dict[str, Any] = {"file_path": name, "w": width, "h": height, **dict(zip(names, parameters))}
+        yield _camera(_Entry(**told), where, viewmat, photos)
 
 
 def _data_lines(path: Path) -> list[str]:
@@ -372,20 +339,20 @@ def _data_lines(path: Path) -> list[str]:
     return [line.rstrip("\r") for line in lines if not line.startswith("#")]
 
 
-def _lenses_txt(model: Path) -> dict[int, ColmapLens]:
-    rows = [line.split() for line in _data_lines(model / "cameras.txt") if line.strip()]
+def _lenses_txt(path: Path) -> dict[int, ColmapLens]:
+    rows = [line.split() for line in _data_lines(path) if line.strip()]
     return {int(r[0]): (r[1], int(r[2]), int(r[3]), [float(v) for v in r[4:]]) for r in rows}
 
 
-def _poses_txt(model: Path) -> list[Pose]:
-    lines = iter(_data_lines(model / "images.txt"))
+def _poses_txt(path: Path) -> list[Pose]:
+    lines = iter(_data_lines(path))
     images = ((line.strip(), next(lines, None)) for line in lines if line.strip())  # and its 2D points, maybe empty
     words = (image.split(" ", 9) for image, _ in images)  # the name comes last and may hold spaces
     return [(w[9], int(w[8]), [float(v) for v in w[1:5]], [float(v) for v in w[5:8]]) for w in words]
 
 
-def _lenses_bin(folder: Path) -> dict[int, ColmapLens]:
-    data = require_file(folder / "cameras.bin").read_bytes()
+def _lenses_bin(path: Path) -> dict[int, ColmapLens]:
+    data = require_file(path).read_bytes()
     (count,), at, found = struct.unpack_from("<Q", data), 8, {}
     for _ in range(count):
         number, kind, width, height = struct.unpack_from("<iiQQ", data, at)
@@ -398,8 +365,8 @@ def _lenses_bin(folder: Path) -> dict[int, ColmapLens]:
     return found
 
 
-def _poses_bin(model: Path) -> list[Pose]:
-    data = require_file(model / "images.bin").read_bytes()
+def _poses_bin(path: Path) -> list[Pose]:
+    data = require_file(path).read_bytes()
     (count,), at, poses = struct.unpack_from("<Q", data), 8, []
     for _ in range(count):
         *pose, lens = struct.unpack_from("<7di", data, at + 4)

@@ -24,7 +24,6 @@ from .ply import TYPES, SplatFile, file_of, header_of, read_ply
 
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 SPZ_MAGIC = b"NGSP"
-SPZ_SH_COUNTS = {0: 0, 1: 3, 2: 8, 3: 15}
 DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, NotImplementedError, RuntimeError)
 SOG_DAMAGE = (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError)
 SPZ_HEADER = 16  # bytes
@@ -78,32 +77,31 @@ def _from_compressed_ply(path: Path) -> Gaussians:
     """PlayCanvas: 256 Gaussians share bounds, values have 8 to 11 bits in them."""
     _, elements, offset = header_of(path)
     data, tables = path.read_bytes(), {}
-    with refusing(f"{path}: a damaged compressed PLY", KeyError, ValueError):
-        for element in elements:
-            kind = np.dtype([(p.name, "<" + TYPES[p.type]) for p in element.properties if p.type != "list"])
-            if offset + element.count * kind.itemsize > len(data):
-                raise BadInput(f"{path} is truncated: element {element.name} is not whole")
-            tables[element.name] = np.frombuffer(data, kind, element.count, offset)
-            offset += element.count * kind.itemsize
-        vertex, bounds = tables["vertex"], tables["chunk"]
-        if len(bounds) * CHUNK_ROWS < len(vertex):
-            raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
-        chunk = np.arange(len(vertex)) // CHUNK_ROWS
+    for element in elements:
+        kind = np.dtype([(n, "<" + TYPES[t]) for n, t in element.properties.items() if t != "list"])
+        if offset + element.count * kind.itemsize > len(data):
+            raise BadInput(f"{path} is truncated: element {element.name} is not whole")
+        tables[element.name] = np.frombuffer(data, kind, element.count, offset)
+        offset += element.count * kind.itemsize
+    vertex, bounds = tables["vertex"], tables["chunk"]
+    if len(bounds) * CHUNK_ROWS < len(vertex):
+        raise BadInput(f"{path}: {len(bounds)} chunks are too few for {len(vertex)} Gaussians")
+    chunk = np.arange(len(vertex)) // CHUNK_ROWS
 
-        def between(unit: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-            low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
-            return low + unit * (high - low)
+    def between(unit: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+        low, high = (np.stack([bounds[f"{end}_{n}"] for n in names], 1)[chunk] for end in ("min", "max"))
+        return low + unit * (high - low)
 
-        means = between(_unpack(vertex["packed_position"], 11, 10, 11), ("x", "y", "z"))
-        log_scales = between(_unpack(vertex["packed_scale"], 11, 10, 11), ("scale_x", "scale_y", "scale_z"))
-        rgba = _unpack(vertex["packed_color"], 8, 8, 8, 8)
-        rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
-        packed = vertex["packed_rotation"]
-        quats = _smallest_three((_unpack(packed, 10, 10, 10) - 0.5) * 2 * SQRT_HALF, (packed >> 30).astype(int))
-        rest, higher = tables.get("sh"), None
-        if rest is not None and rest.dtype.names:
-            steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
-            higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
+    means = between(_unpack(vertex["packed_position"], 11, 10, 11), ("x", "y", "z"))
+    log_scales = between(_unpack(vertex["packed_scale"], 11, 10, 11), ("scale_x", "scale_y", "scale_z"))
+    rgba = _unpack(vertex["packed_color"], 8, 8, 8, 8)
+    rgb = between(rgba[:, :3], ("r", "g", "b")) if "min_r" in (bounds.dtype.names or ()) else rgba[:, :3]
+    packed = vertex["packed_rotation"]
+    quats = _smallest_three((_unpack(packed, 10, 10, 10) - 0.5) * 2 * SQRT_HALF, (packed >> 30).astype(int))
+    rest, higher = tables.get("sh"), None
+    if rest is not None and rest.dtype.names:
+        steps = np.stack([rest[f"f_rest_{k}"] for k in range(len(rest.dtype.names))], 1)
+        higher = (steps * np.float32(8 / 255) - 4).reshape(len(vertex), 3, -1).transpose(0, 2, 1)
     return _gaussians(path, means, log_scales, quats, rgba[:, 3], (rgb - 0.5) / SH_C0, higher)
 
 
@@ -115,9 +113,9 @@ def _from_spz(path: Path) -> Gaussians:
     if len(body) < SPZ_HEADER or body[:4] != SPZ_MAGIC:
         raise BadInput(f"{path} is a gzip file, but no .spz scene")
     version, n, sh_degree, fraction_bits, flags = struct.unpack("<IIBBB", body[4:15])
-    if not 1 <= version <= 4 or sh_degree not in SPZ_SH_COUNTS or (version == 4) == packed or fraction_bits > 24:
+    if not 1 <= version <= 4 or sh_degree > 3 or (version == 4) == packed or fraction_bits > 24:
         raise BadInput(f"{path}: .spz version {version} with SH degree {sh_degree} is not known")
-    count = SPZ_SH_COUNTS[sh_degree]
+    count = (sh_degree + 1) ** 2 - 1
     widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * count)  # bytes of each property
     require_memory(n * (sum(widths) + GAUSSIAN), f"{path} with {n} Gaussians")
     size = SPZ_HEADER + n * sum(widths)  # what its count needs; whatever else is packed there is not unpacked
@@ -132,8 +130,11 @@ def _from_spz(path: Path) -> Gaussians:
         low, middle, high = position.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
         fixed = low | middle << 8 | high << 16
         means = np.where(fixed & 0x800000, fixed - (1 << 24), fixed) / (1 << fraction_bits)
-    if version >= 3:
-        quats = _spz_quats(rotation.view("<u4")[:, 0])
+    if version >= 3:  # three components of 9 bits and a sign, in the order w, z, y, x from the lowest
+        words = rotation.view("<u4")
+        fields = words >> np.array([0, 10, 20], np.uint32) & 1023
+        small = (fields & 511) / 511 * SQRT_HALF * np.where(fields >> 9, -1, 1)
+        quats = _smallest_three(small, 3 - (words[:, 0] >> 30).astype(int))[:, [0, 3, 2, 1]]
     else:
         xyz = rotation / 127.5 - 1
         quats = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
@@ -156,10 +157,8 @@ def _inflated(data: bytes, size: int) -> bytes:
 
 def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
     """The body that the streams of version 4 make up, of so many bytes."""
-    try:
+    with refusing(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard", ImportError):
         import zstandard
-    except ImportError:
-        raise BadInput(f"{path}: .spz version 4 needs the package zstandard; pip install zstandard") from None
     table = int.from_bytes(data[16:20], "little")  # of the streams, whose number is the header's last byte
     offset = table + 16 * data[15]
     if len(data) < max(20, offset):
@@ -174,13 +173,6 @@ def _unpacked_spz_4(data: bytes, size: int, path: Path) -> bytes:
             body += stream.read(unpacked)
         offset += packed
     return bytes(body)
-
-
-def _spz_quats(packed: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz [N, 4] from three components of 9 bits and a sign, in the order w, z, y, x from the lowest."""
-    fields = np.stack([packed >> shift & 1023 for shift in (0, 10, 20)], 1)
-    small = (fields & 511) / 511 * SQRT_HALF * np.where(fields >> 9, -1, 1)
-    return _smallest_three(small, 3 - (packed >> 30).astype(int))[:, [0, 3, 2, 1]]
 
 
 def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
@@ -240,12 +232,10 @@ def _from_sog(opened: Callable[[str], IO[bytes]], path: Path) -> Gaussians:
 
 def _webp(data: bytes, path: Path, most: int) -> np.ndarray:
     """A picture [H, W, 4] uint8, RGBA, of at most so many pixels."""
-    try:
+    with refusing(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert", ImportError):
         import cv2
 
         from .images import announced_pixels, decoded
-    except ImportError:
-        raise BadInput(f"{path}: .sog needs OpenCV; convert the scene with gimp3d convert") from None
     if announced_pixels(data) > most:
         raise BadInput(f"{path}: a picture of the SOG scene is far larger than its count needs")
     picture = decoded(data, f"{path}: a part of the SOG scene")

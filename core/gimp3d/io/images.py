@@ -74,9 +74,14 @@ def announced_pixels(data: bytes) -> int:
         return width * height
     if data[:2] == b"\xff\xd8":
         return _jpeg_pixels(data)
-    if data[8:12] == b"WEBP" and len(data) >= 30:
-        return _webp_pixels(data)
-    return 0
+    if data[8:12] != b"WEBP" or len(data) < 30:
+        return 0
+    if data[12:16] == b"VP8L":
+        sizes = int.from_bytes(data[21:25], "little")
+        return ((sizes & 0x3FFF) + 1) * ((sizes >> 14 & 0x3FFF) + 1)
+    if data[12:16] == b"VP8X":
+        return (int.from_bytes(data[24:27], "little") + 1) * (int.from_bytes(data[27:30], "little") + 1)
+    return (int.from_bytes(data[26:28], "little") & 0x3FFF) * (int.from_bytes(data[28:30], "little") & 0x3FFF)
 
 
 def is_broken_png(data: bytes) -> bool:
@@ -104,15 +109,6 @@ def _jpeg_pixels(data: bytes) -> int:
         skipped = 1 if marker == 0xFF else 2 if alone else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         at = data.find(b"\xff", at + skipped)
     return 0
-
-
-def _webp_pixels(data: bytes) -> int:
-    if data[12:16] == b"VP8L":
-        sizes = int.from_bytes(data[21:25], "little")
-        return ((sizes & 0x3FFF) + 1) * ((sizes >> 14 & 0x3FFF) + 1)
-    if data[12:16] == b"VP8X":
-        return (int.from_bytes(data[24:27], "little") + 1) * (int.from_bytes(data[27:30], "little") + 1)
-    return (int.from_bytes(data[26:28], "little") & 0x3FFF) * (int.from_bytes(data[28:30], "little") & 0x3FFF)
 
 
 def read_mask(path: Path | str) -> np.ndarray:

@@ -21,19 +21,12 @@ TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+PROPERTY_WORDS = {**dict.fromkeys(TYPES, 3), "list": 5}  # of a property's line, by its type
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 CACHED_ROWS = 1 << 12
 MAX_HEADER = 1 << 20  # bytes; a longer header is not a PLY's
 Body = tuple[bytes, np.ndarray, bytes]  # before the vertices, their rows, and behind them
 ANTIALIASED = re.compile(r"SplatRenderMode:\s*mip\b|\bantialiased\s+1\b", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class PlyProperty:
-    """A scalar property of the vertex element."""
-
-    name: str
-    type: str  # as written in the header
 
 
 @dataclass(frozen=True)
@@ -43,7 +36,7 @@ class PlyTable:
     header: tuple[str, ...]  # every line but `end_header`, without line ends
     line_end: str
     format: str  # ascii | binary_little_endian | binary_big_endian
-    properties: tuple[PlyProperty, ...]
+    properties: dict[str, str]  # of the vertices: name → type as written in the header
     rows: np.ndarray  # [N] void records of one row's bytes; ASCII: [N] object array of lines, as bytes
     before: bytes = b""  # the body of elements in front of the vertices, verbatim
     after: bytes = b""  # and behind them
@@ -55,8 +48,7 @@ class PlyTable:
     @property
     def dtype(self) -> np.dtype:
         """The record type of a row in the file's byte order."""
-        order = BYTE_ORDERS[self.format]
-        return np.dtype([(p.name, order + TYPES[p.type]) for p in self.properties])
+        return np.dtype([(n, BYTE_ORDERS[self.format] + TYPES[kind]) for n, kind in self.properties.items()])
 
 
 @dataclass(frozen=True)
@@ -83,23 +75,19 @@ def read_ply(path: Path | str) -> SplatFile:
     """
     head, elements, start = header_of(Path(path))
     names = [e.name for e in elements]
-    if "chunk" in names or any(p.name.startswith("packed_") for e in elements for p in e.properties):
+    if "chunk" in names or any(n.startswith("packed_") for e in elements for n in e.properties):
         raise BadInput(f"{path} is a PlayCanvas compressed PLY; convert it with gimp3d convert first")
     if names.count("vertex") != 1:
         raise BadInput(f"{path}: a PLY with one vertex element expected, found {names.count('vertex')}")
     vertex = elements[names.index("vertex")]
-    if any(p.type == "list" for p in vertex.properties):
+    if "list" in vertex.properties.values():
         raise BadInput(f"{path}: the vertex element has a list property; that is not a Gaussian scene")
-    seen = [p.name for p in vertex.properties]
-    twice = sorted({n for n in seen if seen.count(n) > 1})
-    if twice:
-        raise BadInput(f"{path}: property {', '.join(twice)} occurs twice in the vertex element")
-    if vertex.count and not any(n.startswith("f_dc_") for n in seen):
-        what = "it has plain colours (red, green, blue)" if "red" in seen else "a mesh or a point cloud"
+    if vertex.count and not any(n.startswith("f_dc_") for n in vertex.properties):
+        what = "it has plain colours (red, green, blue)" if "red" in vertex.properties else "a mesh or a point cloud"
         raise BadInput(f"{path} is not a Gaussian scene: no property f_dc_0, {what}")
     read = _read_ascii if head.format == "ascii" else _read_binary
     before, rows, after = read(Path(path), elements, names.index("vertex"), start)
-    table = replace(head, properties=tuple(vertex.properties), rows=rows, before=before, after=after)
+    table = replace(head, properties=vertex.properties, rows=rows, before=before, after=after)
     return SplatFile(gaussians_of(table, path), table)
 
 
@@ -166,8 +154,7 @@ def file_of(gaussians: Gaussians, comments: Sequence[str] = ()) -> SplatFile:
     comments = [*comments, *(["antialiased 1"] if gaussians.antialiased else [])]
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments), "element vertex 0"]
     header += [f"property float {n}" for n in names]
-    properties = tuple(PlyProperty(n, "float") for n in names)
-    table = PlyTable(tuple(header), "\n", "binary_little_endian", properties, np.zeros(0, f"V{4 * len(names)}"))
+    table = PlyTable(tuple(header), "\n", "binary_little_endian", dict.fromkeys(names, "float"), np.zeros(0, "V1"))
     rows = new_rows(table, gaussians).view(f"V{4 * len(names)}")
     return SplatFile(gaussians, replace(table, rows=rows))
 
@@ -178,7 +165,7 @@ class PlyElement:
 
     name: str
     count: int
-    properties: list[PlyProperty] = field(default_factory=list)
+    properties: dict[str, str] = field(default_factory=dict)  # name → type as written in the header, or list
 
 
 def header_of(path: Path) -> tuple[PlyTable, list[PlyElement], int]:
@@ -204,21 +191,22 @@ def header_of(path: Path) -> tuple[PlyTable, list[PlyElement], int]:
             form = words[1]
         elif words[0] == "element" and len(words) == 3 and re.fullmatch(r"\d{1,18}", words[2]):
             elements.append(PlyElement(words[1], int(words[2])))
-        elif words[0] == "property" and elements and len(words) == 3 and words[1] in TYPES:
-            elements[-1].properties.append(PlyProperty(words[2], words[1]))
-        elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":
-            elements[-1].properties.append(PlyProperty(words[4], "list"))
+        elif words[0] == "property" and elements and len(words) > 1 and len(words) == PROPERTY_WORDS.get(words[1]):
+            name, properties = words[-1], elements[-1].properties
+            if name in properties:
+                raise BadInput(f"{path}: property {name} occurs twice in the {elements[-1].name} element")
+            properties[name] = words[1]
         else:
             raise BadInput(f"{path}: the PLY header line {line[:60]!r} makes no sense; the file is damaged")
     if not form:
         raise BadInput(f"{path}: the PLY header names no format")
-    return PlyTable(tuple(lines), line_end, form, (), np.zeros(0, "V1")), elements, end.end()
+    return PlyTable(tuple(lines), line_end, form, {}, np.zeros(0, "V1")), elements, end.end()
 
 
 def _row_bytes(path: Path, element: PlyElement) -> int:
-    if any(p.type == "list" for p in element.properties):  # rows of different sizes
+    if "list" in element.properties.values():  # rows of different sizes
         raise BadInput(f"{path}: element {element.name} with lists in front of the vertices is not supported")
-    return sum(np.dtype(TYPES[p.type]).itemsize for p in element.properties)
+    return sum(np.dtype(TYPES[kind]).itemsize for kind in element.properties.values())
 
 
 def _read_binary(path: Path, elements: Sequence[PlyElement], vertex: int, start: int) -> Body:
@@ -254,15 +242,13 @@ def values(table: PlyTable, path: Path | str = "PLY") -> np.ndarray:
         records = np.ascontiguousarray(table.rows).view(table.dtype) if len(table.rows) else np.zeros(0, table.dtype)
         return records.astype(table.dtype.newbyteorder("="), copy=False)
     width, records = len(table.properties), np.zeros(len(table.rows), table.dtype)
-    try:
+    with refusing(f"{path}: a row holds something that is not a number", ValueError):
         cells = np.array(b" ".join(table.rows).split(), dtype=np.float64)
-    except ValueError:
-        raise BadInput(f"{path}: a row holds something that is not a number") from None
     if any(len(row.split()) != width for row in table.rows):  # the total may be right where lines are cut across
         raise BadInput(f"{path}: rows of {width} numbers expected; the file is damaged")
     with np.errstate(invalid="ignore", over="ignore"):
-        for k, p in enumerate(table.properties):
-            records[p.name] = cells[k::width]
+        for k, name in enumerate(table.properties):
+            records[name] = cells[k::width]
     return records
 
 
@@ -273,8 +259,7 @@ def row_blocks(count: int) -> Iterator[slice]:
 
 def gaussians_of(table: PlyTable, path: Path | str = "PLY") -> Gaussians:
     """The Gaussians that a table holds; raises BadInput if it does not hold any."""
-    names = [p.name for p in table.properties]
-    records = values(table, path)
+    names, records = list(table.properties), values(table, path)
 
     def columns(wanted: Sequence[str]) -> np.ndarray:
         missing = [n for n in wanted if n not in names]
@@ -316,7 +301,7 @@ def _layout(scales: int, rest: int) -> dict[str, list[str]]:
 
 def positions(file: SplatFile) -> np.ndarray:
     """The Gaussians' centres in the file's own precision, [N, 3] float64."""
-    if all(TYPES[p.type] == "f4" for p in file.table.properties if p.name in "xyz"):
+    if all(TYPES[file.table.properties[n]] == "f4" for n in "xyz"):
         return file.gaussians.means.astype(np.float64)
     records = values(file.table)
     return np.stack([records[n].astype(np.float64) for n in "xyz"], -1)
@@ -324,7 +309,7 @@ def positions(file: SplatFile) -> np.ndarray:
 
 def new_rows(table: PlyTable, added: Gaussians) -> np.ndarray:
     """Records for new Gaussians in the table's properties, [M] structured in the file's byte order."""
-    rest = sum(bool(re.fullmatch(r"f_rest_\d+", p.name)) for p in table.properties)
+    rest = sum(bool(re.fullmatch(r"f_rest_\d+", n)) for n in table.properties)
     padded = replace(added, sh=pad_sh(added.sh, rest // 3 + 1))
     records = np.zeros(len(added), table.dtype)
     for part, of_part in _layout(added.log_scales.shape[1], rest).items():

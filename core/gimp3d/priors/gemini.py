@@ -62,8 +62,7 @@ def painter(model: str, call: Call) -> Painter:
         )
         hole = hole > 0
         shown = np.where(hole[..., None], np.array(HIDDEN, np.uint8), shown)
-        pictures = [encode_png(shown), encode_png(hole)]
-        asked = partial(_asked, who, model, key, pictures, aspect, seed, call)
+        asked = partial(_asked, who, model, key, [encode_png(shown), encode_png(hole)], aspect, seed, call)
         answer = decode_image(waited(model, asked, call, lambda: "paints"), f"what {model} answered")
         high, wide = answer.shape[:2]
         if abs(np.log(wide / high / (width / height))) > OTHER_SHAPE:

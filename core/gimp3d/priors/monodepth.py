@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
 
 import cv2
 import numpy as np
@@ -31,7 +31,6 @@ NETWORKS: dict[str, Callable[[str, Path], networks.OnnxModel | networks.TorchMod
     "onnx": networks.read_onnx,
     "torchscript": networks.read_torch,
 }
-LOOKING = (*NETWORKS, "command")  # providers that look at a picture of the view
 USAGE = (
     "use auto, harmonic, planar, file:PATH, onnx:PATH, torchscript:PATH or command:CMD, followed by ,disparity ,depth "
     "or ,metric"
@@ -46,16 +45,11 @@ class DepthPrior:
     kind: str = "disparity"  # disparity | depth | metric
 
 
-def looks(spec: str) -> bool:
-    """Whether a provider looks at a picture of the view without the object."""
-    return spec.partition(":")[0] in LOOKING
-
-
 def depth_prior(
     spec: str,  # auto | harmonic | planar | (file|onnx|torchscript|command):ARGUMENT[,KIND][,WIDTHxHEIGHT]
     height: int,
     width: int,
-    image: np.ndarray | None = None,  # [H, W, 3] uint8, the view without the object; what a model looks at
+    picture: Callable[[], np.ndarray],  # [H, W, 3] uint8, the view without the object; who looks at it asks for it
     call: Call = Call("--depth-prior", "depth"),
 ) -> DepthPrior | None:
     """The prior that `spec` names, of the view's size, or None where the scene alone decides.
@@ -67,32 +61,25 @@ def depth_prior(
     {image} and writes such a file: {out}, a PNG, or {npy}.
     Raises BadInput if the provider is unknown or its file, model or program cannot be used.
     """
-    provider = _provider(spec, call)
+    provider = depth_provider(spec, call)
     if provider is None:
         return None
     look, kind = provider
-    if image is None and looks(spec):
-        raise BadInput(f"{call.option} {spec.partition(':')[0]}: there is no picture to look at")
-    values = look(image, height, width)
+    values = look(picture, height, width)
     if not np.isfinite(values).any():
         raise BadInput(f"{call.option}: {spec.partition(':')[2]} gives no finite value")
     return DepthPrior(cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32), kind)
 
 
-def check_depth_prior(spec: str, call: Call = Call("--depth-prior", "depth")) -> None:
-    """Raise BadInput now if `depth_prior` would for reasons that do not depend on the view."""
-    _provider(spec, call)
+Look = Callable[[Callable[[], np.ndarray], int, int], np.ndarray]  # (picture, height, width) → [h, w] float32
 
 
-Look = Callable[[Any, int, int], np.ndarray]  # (picture or None, height, width) → [h, w] float32
-
-
-def _provider(spec: str, call: Call) -> tuple[Look, str] | None:
-    """Who looks, and what its numbers are."""
+def depth_provider(spec: str, call: Call) -> tuple[Look, str] | None:
+    """Who looks, and what its numbers are; raises what `depth_prior` would for reasons that are not the view's."""
     name, _, rest = spec.partition(":")
     if spec in ("auto", "harmonic", "planar"):
         return None
-    if name not in ("file", *LOOKING) or (name != "file" and not rest):
+    if name != "file" and not (rest and name in (*NETWORKS, "command")):
         raise BadInput(f"{call.option}: unknown provider {spec!r}; {USAGE}")
     who, size = f"{call.option} {name}", None
     if name in NETWORKS:
@@ -101,18 +88,16 @@ def _provider(spec: str, call: Call) -> tuple[Look, str] | None:
     if kind not in KINDS:
         before, kind = rest, "disparity"
     if name == "file":
-        return lambda _, h, w: _from_file(Path(before), kind, h, w), kind
+        return lambda _, height, width: _from_file(Path(before), kind, height, width), kind
     if name in NETWORKS:
         model = NETWORKS[name](who, Path(before))
         size = model.size or size or FREE_SIZE
-        return lambda image, h, w: networks.look(model, size, image, call), kind
+        return lambda picture, *_: networks.look(model, size, picture(), call), kind
     words = split_command(before, call.option, ("{image}", "{out}"), ("{out}", "{npy}"))
-    wrong, answers = "wrote neither {out} nor {npy}", ("npy.npy", "out.png")
 
-    def look(image: np.ndarray, height: int, width: int) -> np.ndarray:
-        return ask_command(
-            words, {"image": image}, answers, wrong, call, lambda path: _from_file(path, kind, height, width)
-        )
+    def look(picture: Callable[[], np.ndarray], height: int, width: int) -> np.ndarray:
+        wrong, read = "wrote neither {out} nor {npy}", partial(_from_file, kind=kind, height=height, width=width)
+        return ask_command(words, {"image": picture()}, ("npy.npy", "out.png"), wrong, call, read)
 
     return look, kind
 

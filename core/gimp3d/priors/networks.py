@@ -76,8 +76,7 @@ def torch_painter(argument: str, call: Call) -> Painter:
         width, height = max(1, round(factor * w)), max(1, round(factor * h))
         more = ((0, -height % MULTIPLE), (0, -width % MULTIPLE), (0, 0))
         picture, hole = with_black_hole(image, mask, width, height)
-        padded = (np.pad(part, more, mode="symmetric") for part in (picture, hole[..., None]))
-        blobs = [part.transpose(2, 0, 1)[None] for part in padded]
+        blobs = [np.pad(p, more, mode="symmetric").transpose(2, 0, 1)[None] for p in (picture, hole[..., None])]
         answer = as_picture(waited(model.path.name, lambda: model.run(*blobs), call), model.who)
         if answer.shape[:2] != blobs[0].shape[2:]:
             sizes = (times(a[::-1]) for a in (answer.shape[:2], blobs[0].shape[2:]))
@@ -210,14 +209,13 @@ class OnnxModel:
         names = [name for name, dims in self.inputs.items() if len(dims) == 4] or [next(iter(self.inputs), "")]
         feeds = {name: np.ascontiguousarray(blob, np.float32) for name, blob in zip(names, blobs)}
         runtime = onnx_runtime()
-        who = "OpenCV" if runtime is None else "ONNX Runtime"
-        failures = cv2.error if runtime is None else Exception  # ONNX Runtime's have no common base
+        failures = Exception if runtime else cv2.error  # ONNX Runtime's have no common base
         try:
-            return self._by_opencv(feeds) if runtime is None else self._by_runtime(runtime, feeds)
+            return self._by_runtime(runtime, feeds) if runtime else self._by_opencv(feeds)
         except failures as error:
-            reason = getattr(error, "err", None) or str(error)
-        advice = "export it to a plain ONNX" if runtime else "install onnxruntime, or export it to a plain ONNX"
-        raise BadInput(f"{self.who}: {who} cannot run it ({one_line(reason, 200)}); {advice}")
+            reason = one_line(getattr(error, "err", None) or error, 200)
+        who, before = ("ONNX Runtime", "") if runtime else ("OpenCV", "install onnxruntime, or ")
+        raise BadInput(f"{self.who}: {who} cannot run it ({reason}); {before}export it to a plain ONNX")
 
     def _by_opencv(self, feeds: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
         level = cv2.setLogLevel(0)  # silent: its complaints come as exceptions too

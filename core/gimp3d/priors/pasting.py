@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..geometry import bounds, dilated
 from ..solvers.patchmatch import nearest_allowed
 from ..solvers.robust import CUT, ROUNDS
 
@@ -56,13 +57,10 @@ class Appearance:
 
 def window_round_hole(hole: np.ndarray) -> tuple[slice, slice]:
     """The hole's bounding box, larger by its own size on every side."""
-    spans = []
-    for axis in (1, 0):
-        there = np.flatnonzero(hole.any(axis))
-        low, high = int(there[0]), int(there[-1]) + 1
-        margin = max(LEAST_SURROUNDINGS, high - low)
-        spans.append(slice(max(0, low - margin), high + margin))
-    return spans[0], spans[1]
+    spans = bounds(hole)
+    margins = [max(LEAST_SURROUNDINGS, s.stop - s.start) for s in spans]
+    rows, cols = (slice(max(0, s.start - m), s.stop + m) for s, m in zip(spans, margins))
+    return rows, cols
 
 
 def interpolated(image: np.ndarray, hole: np.ndarray, method: int = cv2.INPAINT_TELEA) -> np.ndarray:
@@ -84,8 +82,7 @@ def paste_picture(
     Raises BadInput if it has another shape or shows something else.
     """
     picture = resized(picture, hole.shape, name)
-    size = 2 * HALO + 1
-    outside = cv2.dilate(hole.astype(np.uint8), np.ones((size, size), np.uint8)) == 0
+    outside = ~dilated(hole, HALO)
     if known is not None and (outside & known).mean() >= LEAST_COMPARED:
         outside &= known
     if outside.mean() < LEAST_COMPARED:
@@ -208,9 +205,7 @@ def shift_between(image: np.ndarray, picture: np.ndarray, known: np.ndarray) -> 
     h, w = known.shape
     warp = np.eye(2, 3, dtype=np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
-    for factor in (4, 2, 1):
-        if min(h, w) < 32 * factor:
-            continue
+    for factor in (f for f in (4, 2, 1) if min(h, w) >= 32 * f):
         size = (w // factor, h // factor)
         mask = cv2.resize(known.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         view, other = (_details(p, size, mask > 0).astype(np.float32) for p in (image, picture))

@@ -15,9 +15,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from http.client import HTTPException
-from importlib import resources
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +36,7 @@ PROGRESS = "/sdapi/v1/progress?skip_current_image=true"
 MOST_BYTES = 256 << 20  # of an answer
 NO_ANSWER = (AttributeError, LookupError, OverflowError, TypeError, ValueError)  # of JSON that says something else
 PROMPT = "photograph of the empty place, surfaces and textures of the surroundings continued, nothing standing there"
+SHIPPED = Path(__file__).parent / "workflows" / "inpaint.json"
 Values = dict[str, Any]  # what a painter is told: prompt, negative, seed, strength, checkpoint
 NEGATIVE = "object, person, text, watermark, frame, blurry"
 
@@ -49,8 +49,8 @@ def painter(address: str, call: Call) -> Painter:
     """
     url, _, more = address.partition(",")
     server = _Server(url, call)
-    workflow = _workflow(Path(more), server.option) if more.endswith(".json") else None
-    checkpoint = "" if workflow else more
+    own = more.endswith(".json")
+    workflow = _workflow(Path(more) if own else SHIPPED, server.option)
 
     def paint(image: np.ndarray, mask: np.ndarray, seed: int, call: Call) -> np.ndarray:
         h, w = mask.shape
@@ -59,11 +59,11 @@ def painter(address: str, call: Call) -> Painter:
             image = interpolated(image, mask)  # a trace of what stands there comes through
         shown, hole = scaled(image, width, height), scaled(mask.astype(np.uint8), width, height) > 0
         values: Values = {"prompt": f"{call.prompt}, {PROMPT}" if call.prompt else PROMPT, "negative": NEGATIVE}
-        values |= {"seed": seed, "strength": call.strength, "checkpoint": checkpoint}
+        values |= {"seed": seed, "strength": call.strength, "checkpoint": "" if own else more}
         work = _Comfy(server, workflow) if server.is_comfy() else _Automatic(server)
-        if workflow and isinstance(work, _Automatic):
+        if own and isinstance(work, _Automatic):
             raise BadInput(f"{server.option}: {url} is no ComfyUI; workflows are ComfyUI's, leave {more} away")
-        data = waited(server.host, lambda: work.paint(shown, hole, values), call, work.words, work.stop)
+        data = waited(server.host, lambda: work.paint(shown, hole, values), call, lambda: work.doing, work.stop)
         answer = resized(decode_image(data, f"what {url} answered"), (height, width), f"the picture from {url}")
         return scaled(answer, w, h)
 
@@ -153,13 +153,13 @@ class _Server:
         return answer
 
     def _json(self, data: bytes) -> Any:
-        try:
-            return parse_json(data, self.url)
-        except BadInput:
-            self.misunderstood(data[:60].decode("utf-8", "replace"))
+        with refusing(self.unclear, BadInput):
+            return parse_json(data, data[:60].decode("utf-8", "replace"))
 
-    def misunderstood(self, what: str) -> NoReturn:
-        raise BadInput(f"{self.option}: cannot understand what {self.url} answered ({one_line(what)})")
+    @property
+    def unclear(self) -> str:
+        """What is wrong with an answer that says something else than it should."""
+        return f"{self.option}: cannot understand what {self.url} answered"
 
 
 class _NotThere(BadInput):
@@ -178,26 +178,22 @@ class _Comfy:
     """A prompt in ComfyUI's queue."""
 
     server: _Server
-    workflow: dict[str, Any] | None  # None: the one that comes with this program
+    workflow: dict[str, Any]
     prompt_id: str = ""
     doing: str = "gets the picture"
     stopped: bool = False
 
     def paint(self, image: np.ndarray, mask: np.ndarray, values: Values) -> bytes:
         server, values = self.server, dict(values)
-        try:
+        with refusing(server.unclear, *NO_ANSWER):
             for name, picture in (("image", image), ("mask", mask)):
                 data = encode_png(picture)
                 named = f"gimp3d-{hashlib.sha256(data).hexdigest()[:16]}.png"  # the same picture is not kept twice
                 answer = server.upload("/upload/image", named, data)
                 values[name] = "/".join(filter(None, (answer.get("subfolder", ""), answer.get("name", named))))
-            shipped = resources.files(__package__).joinpath("workflows/inpaint.json")
-            workflow = self.workflow or json.loads(shipped.read_text(encoding="utf-8"))
-            if "{checkpoint}" in json.dumps(workflow):
+            if "{checkpoint}" in json.dumps(self.workflow):
                 values["checkpoint"] = self._checkpoint(values["checkpoint"])
-            answer = server.post("/prompt", {"prompt": filled(workflow, values), "client_id": uuid.uuid4().hex})
-            if not isinstance(answer, dict) or "prompt_id" not in answer:
-                server.misunderstood(json.dumps(answer))
+            answer = server.post("/prompt", {"prompt": filled(self.workflow, values), "client_id": uuid.uuid4().hex})
             self.prompt_id = str(answer["prompt_id"])
             while not self.stopped:
                 history = server.get(f"/history/{self.prompt_id}")
@@ -205,18 +201,13 @@ class _Comfy:
                     return self._picture(history[self.prompt_id])
                 self.doing = "paints" if self._is_running() else "has others to paint first"
                 time.sleep(POLL)
-        except NO_ANSWER as error:
-            server.misunderstood(f"{type(error).__name__}: {error}")
         raise BadInput(f"{server.option}: stopped")  # nobody waits for it any longer
 
     def _checkpoint(self, wanted: str) -> str:
         """The model that is named, else the first one for inpainting, else the first one."""
         loader = "CheckpointLoaderSimple"
         found = self.server.get(f"/object_info/{loader}")
-        try:
-            names = [str(name) for name in found[loader]["input"]["required"]["ckpt_name"][0]]
-        except NO_ANSWER:
-            self.server.misunderstood(json.dumps(found))
+        names = [str(name) for name in found[loader]["input"]["required"]["ckpt_name"][0]]
         if not names or (wanted and wanted not in names):
             there = f"it has {', '.join(names)}" if names else "put one into its models/checkpoints"
             raise BadInput(f"{self.server.option}: {self.server.url} has no checkpoint {wanted}; {there}")
@@ -241,9 +232,6 @@ class _Comfy:
             raise BadInput(f"{self.server.option}: the workflow saved no picture; it needs a node Save Image")
         query = {key: pictures[0].get(key, "") for key in ("filename", "subfolder", "type")}
         return self.server.ask(f"/view?{urllib.parse.urlencode(query)}")
-
-    def words(self) -> str:
-        return self.doing
 
     def stop(self) -> None:
         """Take our prompt out of the queue; interrupt only if it is ours that is painted."""
@@ -275,13 +263,12 @@ class _Automatic:
         if values["checkpoint"]:
             request["override_settings"] = {"sd_model_checkpoint": values["checkpoint"]}
         answer = self.server.post("/sdapi/v1/img2img", request)
-        try:
+        with refusing(self.server.unclear, *NO_ANSWER):
             text = answer["images"][0]
             return base64.b64decode(text.partition(",")[2] if text.startswith("data:") else text, validate=True)
-        except NO_ANSWER:
-            self.server.misunderstood(json.dumps(answer)[:60])
 
-    def words(self) -> str:
+    @property
+    def doing(self) -> str:
         with suppress(BadInput, *NO_ANSWER):
             return f"paints, {float(self.server.get(PROGRESS, QUICK)['progress']):.0%}"
         return "paints"

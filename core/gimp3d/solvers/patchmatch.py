@@ -76,7 +76,8 @@ def nearest_neighbour_field(
         radius -= 1
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
-    nothing = NearestNeighbourField(*np.full((2, *target.shape), -1, np.int32), np.zeros(target.shape, np.float32))
+    rows, cols = np.full((2, *target.shape), -1, np.int32)
+    nothing = NearestNeighbourField(rows, cols, np.zeros(target.shape, np.float32))
     unguided = np.empty((*target.shape, 0), np.float32)
     return refined(nothing, patches, target, allowed, settings, penalty, unguided, index)
 

@@ -27,6 +27,11 @@ LEAST_WEIGHT, MOST_WEIGHT = 1e-30, 1e30  # weaker ones do not count, stronger on
 STEPS = 0.5  # by which links of a coarser grid count
 MOST_ITERATIONS = 5000  # 10 are usual, hundreds are taken by mazes of one-pixel walls
 AXES = ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]))  # pixels and their neighbours to the right, and below
+SMOOTHING = 1.5  # px, σ below which the values' own noise is smoothed away
+TENSION = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
+UNKNOWNS = 4000  # at most; larger domains are solved on a coarser grid
+STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
+OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
 
 SMOOTHING = 1.5  # px, σ below which the values' own noise is smoothed away
 TENSION = 1.0  # length, in radii of the hole, beyond which the plate is a membrane

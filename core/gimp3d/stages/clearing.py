@@ -57,31 +57,6 @@ def object_pixels(
     return parallel_map(of, views)
 
 
-def vouching(
-    kept: Gaussians,
-    rows: np.ndarray,  # [N] bool
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],
-    least: float,  # share of what a Gaussian draws in a view
-) -> tuple[np.ndarray, np.ndarray]:
-    """How many photos show at least so much of each kept Gaussian, and its weight that they do not show, both [N].
-
-    Weights are blend weights in the emptied scene; a photo does not show what lies where the object is, and does not
-    tell what is right beside it. Haze, which only the removal reveals, is shown by none.
-    """
-
-    def of(pair: tuple[ViewMasks, Witness]) -> np.ndarray:
-        view, witness = pair
-        labels = np.full(witness.hidden.shape, ELSE, np.uint8)
-        labels[witness.beside] = 0
-        labels[witness.hidden] = OBJECT
-        hidden, seen = label_weights(kept, view.camera, labels, ELSE, rows)
-        return np.stack([(seen > LEAST_SEEN) & (seen >= least * (seen + hidden)), hidden])
-
-    photos, hidden = total_over(list(zip(views, witnesses)), of, (2, len(kept)))
-    return np.where(rows, photos, 0), np.where(rows, hidden, 0)
-
-
 def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[Laid]) -> np.ndarray:
     """[M] rows taken for the object that do not stand before a surface: splats of floors mostly lie a little below."""
     rows = np.flatnonzero(np.isin(selection.fates, (Fate.REMOVED_INSIDE, Fate.REMOVED_STRADDLING)))
@@ -121,10 +96,9 @@ def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[
 
     def of(witness: Witness) -> Witness:
         hits = first_hits(charts, witness.camera, np.ones(witness.hidden.shape, bool))
-        rests = np.zeros(witness.hidden.shape, bool)
+        rests = hits.of([chart.rests for chart in charts])
         for number, chart in enumerate(charts):
-            there = (hits.chart == number) & ~hits.behind(witness.depth, chart.tolerance)
-            rests[there] = chart.rests[hits.rows[there], hits.cols[there]]
+            rests &= (hits.chart != number) | ~hits.behind(witness.depth, chart.tolerance)
         return replace(witness, hidden=witness.hidden | rests)
 
     return parallel_map(of, witnesses)
@@ -134,20 +108,25 @@ def clear_air(
     scene: Gaussians,
     region: Region,
     selection: Selection,
-    views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     charts: Sequence[Chart],
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
-    """Remove what only the removal reveals and no photo shows, and rests of the object."""
-    stays = ~selection.removed
-    kept = scene.take(stays)
-    near = near_region(scene, region, 1.0)[stays]
-    photos, hidden = vouching(kept, near, views, witnesses, settings.observed)
-    fates = selection.fates.copy()
-    haze = near & kept.usable & (photos == 0) & (hidden > HAZE_WEIGHT)
-    fates[np.flatnonzero(stays)[haze]] = Fate.REMOVED_REVEALED
-    rows = np.flatnonzero(stays)[near & kept.usable]
+    """Remove what only the removal reveals and no photo shows, and rests of the object.
+
+    A photo shows a Gaussian by a share of what that draws in the emptied scene: not what lies where the object is, and
+    it does not tell what is right beside that.
+    """
+    stays, near = ~selection.removed, scene.usable & near_region(scene, region, 1.0)
+    kept, rows, fates = scene.take(stays), np.flatnonzero(stays & near), selection.fates.copy()
+
+    def of(witness: Witness) -> np.ndarray:
+        labels = np.where(witness.hidden, OBJECT, np.where(witness.beside, 0, ELSE)).astype(np.uint8)
+        hidden, seen = label_weights(kept, witness.camera, labels, ELSE, near[stays])
+        return np.stack([(seen > LEAST_SEEN) & (seen >= settings.observed * (seen + hidden)), hidden])
+
+    photos, hidden = total_over(witnesses, of, (2, len(kept)))[:, near[stays]]
+    fates[rows[(photos == 0) & (hidden > HAZE_WEIGHT)]] = Fate.REMOVED_REVEALED
     means = scene.means[rows].astype(np.float64)
     for chart in charts:
         index, *at, z = framed(chart.camera, means)
@@ -157,58 +136,36 @@ def clear_air(
     return Selection(fates)
 
 
-@dataclass(frozen=True)
-class Targets:
-    """Views without the object, and where charts are in them."""
-
-    views: tuple[ViewMasks, ...]
-    hits: tuple[Hits, ...]  # of the same views
-
-
 def chart_targets(
     scene: Gaussians,
     selection: Selection,
     views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     charts: Sequence[Chart],
-    tolerance: float,
     marked: Sequence[np.ndarray],  # [H, W] bool each: to be filled too
-    settings: ClearingSettings = ClearingSettings(),
-) -> Targets:
-    """T of every view: rays that meet a chart's hole, or a chart where the emptied scene has no surface.
+) -> list[tuple[ViewMasks, Hits]]:
+    """T of every view: rays that meet a chart's hole, or a chart where the emptied scene has no surface. And what of
+    the charts its rays meet.
 
     What the scene, emptied, shows clearly before a chart is not filled: other photos saw it.
     """
-    removed = selection.removed
-    gone = scene.take(removed)
+    removed, tolerance = selection.removed, max(c.tolerance for c in charts)
+    gone, open_ = scene.take(removed), [c.hole | c.below for c in charts]
 
     def of(k: int) -> tuple[ViewMasks, Hits]:
         view, hidden = views[k], witnesses[k].hidden
         window = window_mask(touched_window(gone, view.camera, REACH), view.camera) | hidden
         drawn = drawing(scene, view.camera, with_colour=False, pixels=window)
-        depth, alpha = drawn.surface_depth(gone=removed)
-        touched = drawn.footprint(removed) > TOUCHED
-        depth_after = np.where(window, depth, view.depth_before)
-        alpha_after = np.where(window, alpha, view.alpha_before)
+        with_object = view.depth_before, view.alpha_before
+        depth, alpha = (np.where(window, a, b) for a, b in zip(drawn.surface_depth(gone=removed), with_object))
         hits = first_hits(charts, view.camera, window)
-        unseen = np.zeros(window.shape, bool)
-        for number, chart in enumerate(charts):
-            there = hits.chart == number
-            unseen[there] = (chart.hole | chart.below)[hits.rows[there], hits.cols[there]]
-        met = hits.depth > 0
-        bare = met & (alpha_after < SURFACE)
-        before = (alpha_after >= SURFACE) & hits.behind(depth_after, tolerance)
-        gone_from = hidden | touched
-        target = (hidden & unseen & ~before) | (gone_from & bare & (view.alpha_before >= SURFACE))
+        unseen, met = hits.of(open_), hits.depth > 0
+        before = (alpha >= SURFACE) & hits.behind(depth, tolerance)
+        gone_from = hidden | (drawn.footprint(removed) > TOUCHED)
+        target = (hidden & unseen & ~before) | (gone_from & met & (alpha < SURFACE) & (view.alpha_before >= SURFACE))
         target = dilated(cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3))), RIM)
-        target &= met & ~before & gone_from & ~view.occluder
-        return replace(
-            view,
-            silhouette=hidden | witnesses[k].beside,
-            target=target | marked[k],
-            depth_after=depth_after,
-            alpha_after=alpha_after,
-        ), hits
+        target = (target & met & ~before & gone_from & ~view.occluder) | marked[k]
+        touched = hidden | witnesses[k].beside
+        return replace(view, silhouette=touched, target=target, depth_after=depth, alpha_after=alpha), hits
 
-    found = parallel_map(of, range(len(views)))
-    return Targets(tuple(v for v, _ in found), tuple(h for _, h in found))
+    return parallel_map(of, range(len(views)))

@@ -56,8 +56,6 @@ def levelled(found: Sequence[Exposure]) -> tuple[float, str]:
 def exposure_ring(view: ViewMasks) -> np.ndarray:
     """[H, W] bool: the pixels round the object that a photo and the splats are compared in."""
     silhouette = view.silhouette
-    if not silhouette.any():
-        return silhouette
     distance = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, 5)
     reach = max(LEAST_REACH, 0.5 * float(np.sqrt(silhouette.sum())))
     return (distance > 0) & (distance <= reach) & (view.alpha_after > SOLID) & ~view.target

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..gaussians import SH_C0, Gaussians, sh_basis
+from ..gaussians import SH_C0, Gaussians, encoded, linear, sh_basis
 from ..geometry import Window, dilated, directions, window_round
 from ..raster import PixelRegion, label_weights, pixel_region
-from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
 from .charts.plane import Hits, first_hits, pictured
 from .ground import Ground
@@ -46,15 +45,9 @@ class Lifted:
     shaded: tuple[np.ndarray, ...]  # [H, W] bool, what changed in them
     dark: tuple[np.ndarray, ...]  # [H, W] bool, what is too dark to be lifted, or would be too bright: it is filled
     rows: np.ndarray  # [M] of the scene whose colours changed
-    sh: np.ndarray  # [M, K, 3] their new ones
+    gaussians: Gaussians  # [M], with their new ones
     confidence: float
     reason: str
-
-    def scene(self, scene: Gaussians) -> Gaussians:
-        """The scene with the new colours."""
-        sh = scene.sh.copy()
-        sh[self.rows] = self.sh
-        return replace(scene, sh=sh)
 
 
 def lift(
@@ -88,7 +81,8 @@ def lift(
         light, shaded = tuple(map(np.minimum, light, left)), tuple(map(np.logical_or, shaded, changed))
         words.append(f"{np.mean([c.mean() for c in changed]):.1%} of the views' pixels and {len(new)} Gaussians {how}")
     confidence = min(step[0] for step in steps)
-    return Lifted(before, photos, light, shaded, dark, rows, sh[rows], confidence, "; ".join(words))
+    lit = replace(scene.take(rows), sh=sh[rows])
+    return Lifted(before, photos, light, shaded, dark, rows, lit, confidence, "; ".join(words))
 
 
 def lifted_photos(shadow: Shadow, witnesses: Sequence[Witness]) -> list[Undone]:

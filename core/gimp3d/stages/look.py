@@ -103,11 +103,8 @@ def box_polygon(box: Box, camera: Camera) -> np.ndarray | None:
 
 def fill_polygon(polygon: np.ndarray, camera: Camera) -> np.ndarray:
     """[H, W] bool: pixels whose centre lies inside a convex polygon [M, 2] of either orientation, in pixels."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    low, high = polygon.min(0), polygon.max(0)
-    ends = np.clip([np.floor(low), np.ceil(high)], 0, [camera.width, camera.height]).astype(int)
-    cols, rows = (slice(*e) for e in ends.T)
-    x, y = np.meshgrid(*(np.arange(*e) + 0.5 for e in ends.T))
+    mask, (rows, cols) = np.zeros((camera.height, camera.width), bool), window_round(polygon, camera)
+    x, y = np.meshgrid(*(np.arange(s.start, s.stop) + 0.5 for s in (cols, rows)))
     mask[rows, cols] = _inside(polygon.astype(np.float64), x, y)
     return mask
 
@@ -146,8 +143,6 @@ def depth_agreement(views: Sequence[ViewBefore]) -> float:
         through = (there > z * (1 + coarse)) | (there == 0)
         return np.array([(np.abs(there - z) <= coarse * z).sum(), through.sum()])
 
-    if len(views) < 2:
-        return 1.0
     same, through = np.sum(parallel_map(compared, range(len(views))), axis=0)
     return float(same / (same + through)) if same + through else 1.0
 

@@ -17,9 +17,8 @@ from ..gaussians import Gaussians
 from ..geometry import bounds, dilated, window_mask
 from ..progress import Progress, silent
 from ..raster import drawing, touched_window
-from .growth import Growth
 from .look import AROUND, ViewBefore, box_polygon, depth_agreement, fill_polygon, in_front, look, uncovered
-from .selection import Selection, SelectionSettings, by_centre, choose, select_removed
+from .selection import Growth, Selection, SelectionSettings, by_centre, choose, select_removed
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -85,8 +84,7 @@ class Masks:
     """The removal's masks in every usable view."""
 
     selection: Selection
-    views: tuple[ViewMasks, ...]
-    left_out: tuple[str, ...]  # IDs of cameras inside the region, or whose frame misses it
+    views: tuple[ViewMasks, ...]  # but those inside the region, or whose frame misses it
     mode: str  # the mode really used
     confidence: float
     reason: str
@@ -139,7 +137,7 @@ def find_masks(
         raise BadInput(f"masks: unknown mode {settings.mode!r}; use need or paper")
     inside = select_removed(gaussians, region)
     if not inside.any():
-        return Masks(by_centre(inside), (), (), settings.mode, 1.0, "the region holds no Gaussian: nothing to remove")
+        return Masks(by_centre(inside), (), settings.mode, 1.0, "the region holds no Gaussian: nothing to remove")
     if inside[gaussians.usable].all():
         raise IllPosed("ROI: it holds the whole scene; nothing would be left to fill from, make it smaller")
     outlined = _outlined(region, cameras)
@@ -165,21 +163,12 @@ def find_masks(
         return _view_masks(gaussians, gone, selection.removed, view, mode, not warnings)
 
     views = tuple(over(masked, before))
-    reason = f"{selection.words}; {len(views)} views see the region"
+    confidence = len(views) / len(cameras) * (0.5 if warnings else 1.0)
+    reason = "; ".join([*warnings, selection.words, f"{len(views)} views see the region"])
     told = [growth.words] if growth and growth.words else []
     if settings.grow and growth is None:
         told = ["--grow does nothing here: the boxes alone tell what goes, as always in the preset paper"]
-    seeing = {b.camera.id for b in before}
-    return Masks(
-        selection,
-        views,
-        left_out=tuple(c.id for c in cameras if c.id not in seeing),
-        mode=mode,
-        confidence=len(views) / len(cameras) * (0.5 if warnings else 1.0),
-        reason="; ".join([*warnings, reason]),
-        warnings=(*warnings, *told),
-        growth=growth,
-    )
+    return Masks(selection, views, mode, confidence, reason, (*warnings, *told), growth)
 
 
 def _outlined(region: Region, cameras: Sequence[Camera]) -> list[tuple[Camera, list[np.ndarray]]]:
@@ -241,13 +230,12 @@ def _view_masks(
     for whole, part in zip(shown_after, scene.surface_depth(gone=removed)):
         whole[window] = part[window]
     weight = scene.footprint(removed)[window]
-    silhouette, occluder, beside, target = np.zeros((4, *depth.shape), bool)
+    silhouette, occluder, target = np.zeros((3, *depth.shape), bool)
     silhouette[window] = weight > CHANGED
     if consistent:
         occluder[window] = in_front(depth[window], weight > MOSTLY_OBJECT)
-    beside[window] = dilated(occluder[window], 2)
     if mode == "paper":  # beside what is in front T must not outgrow the object
-        target = uncovered(gaussians, removed, before) & ~occluder & (silhouette | ~beside)
+        target = uncovered(gaussians, removed, before) & ~occluder & (silhouette | ~dilated(occluder, 2))
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
     return ViewMasks(camera, before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after)

@@ -70,10 +70,9 @@ def complete_depth(
     """Fill a hole in a disparity map.
 
     With a prior, in the gradient domain (paper 3.3): Δd = s_f Δd_m on the hole with d fixed on its known rim and
-    natural boundaries elsewhere; the printed divergence has the opposite sign (docs/method.md). Without one, what is
-    round the hole is continued, as the settings say. Known pixels that are NaN, infinite or negative are not known,
-    pixels that do not agree with a prior that does fit are no rim. A part of the hole that has no rim takes the prior,
-    aligned to the ring, or the nearest depth.
+    natural boundaries elsewhere (printed with the opposite sign: docs/method.md). Without one, what is round it is
+    continued. Pixels that are NaN, infinite or negative are not known, pixels that do not agree with a prior that does
+    fit are no rim. A part of the hole that has no rim takes the prior, aligned to the ring, or the nearest depth.
 
     Raises
     ------

@@ -68,9 +68,7 @@ class Refinement:
 
     gaussians: Gaussians
     steps: int  # of the kept state
-    before: float  # loss of the held-out views
-    after: float
-    confidence: float
+    confidence: float  # by how much the loss of the held-out views fell, of what is left
     reason: str
 
 
@@ -96,7 +94,7 @@ def refine_gaussians(
     """
     seen = looked_at([o for o in observations if o.counting(margin).any()], settings)
     if settings.steps == 0 or not len(new) or not seen:
-        return Refinement(new, 0, 0.0, 0.0, 1.0, "no refinement: the closed form is final")
+        return Refinement(new, 0, 1.0, "no refinement: the closed form is final")
     views = parallel_map(lambda o: _View(frozen, o, margin), seen)
     judges = views[HELD_OUT // 2 :: HELD_OUT] or views[:1]
     learners = [v for v in views if v not in judges] or views
@@ -124,7 +122,7 @@ def refine_gaussians(
         f"{kept_step} of {settings.steps} steps on {len(learners)} views kept: the loss of {len(judges)} held-out "
         f"views fell from {before:.4f} to {best:.4f}"
     )
-    return Refinement(kept, kept_step, before, best, min(1.0, before / max(best, 1e-9) - 1), reason)
+    return Refinement(kept, kept_step, min(1.0, before / max(best, 1e-9) - 1), reason)
 
 
 class _State:

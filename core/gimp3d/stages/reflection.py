@@ -13,15 +13,13 @@ from scipy.optimize import nnls
 from ..box import Region
 from ..camera import Camera
 from ..compute.threads import parallel_map
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, decoded, linear
 from ..geometry import colours_at
 from ..raster import render
-from ..srgb import decoded, linear
 from .charts.plane import Plane, extent
-from .ground import ROUGH, Ground
+from .ground import ROUGH, Ground, standing
 from .light_search import EARNS, FITS, places_elsewhere
-from .occluder import standing
-from .witness import Says, Witness, ask
+from .witness import Says, Witness, ask, spread
 
 MOST_VIEWS = 24
 SEVERAL = 3  # photos that must show a place before they can be compared
@@ -144,8 +142,7 @@ def find_reflection(
     if not grounds or grounds[0].plane is not plane or not len(object_):
         return "no reflection found: photos do not show the surface that the object stands on"
     ground = grounds[0]
-    count = min(MOST_VIEWS, len(witnesses))
-    used = [witnesses[k * len(witnesses) // count] for k in range(count)]
+    used = spread(witnesses, MOST_VIEWS)
     known = np.zeros_like(ground.known)
     known[::2, ::2] = ground.known[::2, ::2]
     points = ground.points()[known]

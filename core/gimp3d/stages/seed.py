@@ -30,8 +30,6 @@ NEEDED = 0.25  # blend weight that a Gaussian must reach in some pixel, or it is
 HOLD = 3.0  # px of blend weight by which colours, and their view dependence, are held at the closed form's
 LOOKS = 12  # painted views that colours are corrected by; more gain nothing that is measured
 
-Look = tuple[Camera, PaintedView]
-
 
 @dataclass(frozen=True)
 class SeedSettings:
@@ -145,8 +143,7 @@ def _halved(rectangles: np.ndarray, tables: _SumTables) -> np.ndarray:
         first[:, 2 + axis] //= 2
         second = first.copy()
         second[:, axis] += first[:, 2 + axis]
-        misfit = (tables.misfit(first) + tables.misfit(second))[:, :3].sum(1)
-        sides = first[:, 2:]
+        misfit, sides = (tables.misfit(first) + tables.misfit(second))[:, :3].sum(1), first[:, 2:]
         halves.append((first, second))
         misfits.append(np.where((sides == 0).any(1) | (sides.max(1) > 4 * sides.min(1)), np.inf, misfit))
     down = (misfits[0] < misfits[1])[:, None]  # equal, as where all is flat: squares come of it, as sides alternate
@@ -198,7 +195,7 @@ def settle_gaussians(
     scene: Gaussians,
     seeds: Gaussians,
     reference: Camera,
-    looks: Sequence[Look],
+    painted: Sequence[PaintedView],
     settings: SeedSettings = SeedSettings(),
 ) -> Gaussians:
     """The seeds that show somewhere, of the scene's SH degree, in colours by which it, drawn, shows the painted views.
@@ -212,13 +209,13 @@ def settle_gaussians(
     """
     degree, sh = min(settings.sh_degree, scene.sh_degree), seeds.sh
     if degree > 0 and not settings.corrections:
-        sh = _fitted_at_centres(seeds, reference, looks, degree, settings.harmonics)
+        sh = _fitted_at_centres(seeds, reference, painted, degree, settings.harmonics)
     sh = pad_sh(sh, (scene.sh_degree + 1) ** 2).copy()
     sh[:, 0] += (0.5 - settings.grey) / SH_C0
     new = replace(seeds, sh=sh)
     if not settings.corrections:
         return new
-    others = [(view, paint) for view, paint in looks if paint.rules.any() and view.id != reference.id]
+    others = [p for p in painted if p.rules.any() and p.camera.id != reference.id]
     looks = others[:: math.ceil(len(others) / LOOKS) or 1]
     joined = scene.extended(new)
 
@@ -226,18 +223,17 @@ def settle_gaussians(
         there = window_mask(touched_window(new, camera), camera)
         return contributions(joined, camera, pixels=there).peak[len(scene) :]
 
-    def step(look: Look) -> tuple[np.ndarray, np.ndarray]:
+    def step(paint: PaintedView) -> tuple[np.ndarray, np.ndarray]:
         """See missing_colours: of what the view's own pixels painted."""
-        camera, paint = look
-        wanted = np.isin(paint.rule_map(camera.height, camera.width), OWN_RULES)
-        region = pixel_region(scene, camera, wanted, passes=frozenset({"rgb"}))
+        wanted = np.isin(paint.rule_map(), OWN_RULES)
+        region = pixel_region(scene, paint.camera, wanted, passes=frozenset({"rgb"}))
         return missing_colours(region, new, wanted, paint.pasted(np.zeros((*wanted.shape, 3), np.uint8)))
 
-    peaks = parallel_map(peak, [reference, *(view for view, _ in looks)])
+    peaks = parallel_map(peak, [reference, *(p.camera for p in looks)])
     new = new.take(np.max(peaks, axis=0) >= NEEDED)
     for _ in range(settings.corrections if looks else 0):
         steps = parallel_map(step, looks)
-        towards = [directions(new.means.astype(np.float64), view) for view, _ in looks]
+        towards = [directions(new.means.astype(np.float64), p.camera) for p in looks]
         change = _colour_change(steps, towards, degree, HOLD)
         sh = new.sh.copy()
         sh[:, : change.shape[1]] += change
@@ -246,24 +242,22 @@ def settle_gaussians(
 
 
 def _fitted_at_centres(
-    seeds: Gaussians, reference: Camera, looks: Sequence[Look], degree: int, settings: HarmonicsSettings
+    seeds: Gaussians, reference: Camera, painted: Sequence[PaintedView], degree: int, settings: HarmonicsSettings
 ) -> np.ndarray:
     """The paper's SH [N, K, 3] of the seeds."""
     means = seeds.means.astype(np.float64)
 
-    def seen_in(look: Look) -> Seen:
+    def seen_in(paint: PaintedView) -> Seen:
         """By pixels of the view's own."""
-        view, paint = look
-        height, width = paint.rules.shape
-        part = cropped(view, (slice(paint.top, paint.top + height), slice(paint.left, paint.left + width)))
+        part = cropped(paint.camera, paint.part)
         visible = np.flatnonzero(sees(part, paint.depth, means, SAME_DEPTH))
         cols, rows = part.project(means[visible])[0].astype(int).T
         own = np.isin(paint.rules[rows, cols], OWN_RULES)
         index = visible[own]
-        return index, directions(means[index], view), paint.image[rows[own], cols[own]] / 255.0
+        return index, directions(means[index], paint.camera), paint.image[rows[own], cols[own]] / 255.0
 
     colours = 0.5 + SH_C0 * seeds.sh[:, 0].astype(np.float64)
-    return fit_harmonics(colours, directions(means, reference), parallel_map(seen_in, looks), degree, settings)
+    return fit_harmonics(colours, directions(means, reference), parallel_map(seen_in, painted), degree, settings)
 
 
 def _colour_change(

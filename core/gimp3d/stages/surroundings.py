@@ -21,10 +21,11 @@ from ..compute.threads import parallel_map, run_ranges
 from ..geometry import surface_points
 from .look import box_window
 
-CELLS = 800_000  # of the grid round one box at most: more take seconds and hold too few points each
-VIEWS = 60  # at most so many, spread evenly, are gathered: further ones show the same surface
-BEYOND = 0.25  # how far the grid reaches beyond each face of the box, as a share of its size across
-SEEDS = 0.1  # width of the grid's outer layer, where growth starts, as such a share
+# Each of a fine grid, and of a coarse one.
+CELLS = 800_000, 200_000  # of the grid round one box at most: more take seconds and hold too few points each
+VIEWS = 60, 20  # at most so many, spread evenly, are gathered: further ones show the same surface
+BEYOND = 0.25, 0.1  # how far the grid reaches beyond each face of the box, as a share of its size across
+SEEDS = 0.1, 0.05  # width of the grid's outer layer, where growth starts, as such a share
 LEAST_CELL = 1.5  # edge of a cell, pixels of a usual view: narrower ones stay empty between pixels
 LEAST_POINTS = 3  # in a cell that counts as surface: as many as span a plane
 # Of a cell against the plane of those reached before it; test_surroundings holds them against shapes that are known.
@@ -68,17 +69,14 @@ def follow_surface(
     box: Box,
     region: Region,  # where growth cannot start
     views: Sequence[tuple[Camera, np.ndarray]],  # (camera, z-depth [H, W] with the object, 0 = nothing)
-    beyond: float = BEYOND,
-    seeds: float = SEEDS,
-    most_cells: int = CELLS,
-    most_views: int = VIEWS,
+    coarse: bool = False,
 ) -> FollowedSurface:
     """Follow the surface round a box into it."""
-    half = box.size * (0.5 + beyond)
+    half = box.size * (0.5 + BEYOND[coarse])
     pixel = float(np.median([abs(c.to_camera(box.center)[2]) / c.fx for c, _ in views]))
     points_per_cell = SLANTED * len(views)  # of cells as large as a pixel
     least = pixel * max(LEAST_CELL, math.sqrt(LEAST_POINTS / points_per_cell))
-    cell = max(least, float((8 * half.prod() / most_cells) ** (1 / 3)))
+    cell = max(least, float((8 * half.prod() / CELLS[coarse]) ** (1 / 3)))
     dims = tuple(int(n) + 2 * MARGIN for n in np.ceil(2 * half / cell))
 
     def points_in(view: tuple[Camera, np.ndarray]) -> np.ndarray:
@@ -90,7 +88,7 @@ def follow_surface(
         local = (points - box.center) @ box.axes
         return local[(np.abs(local) < half).all(1)]
 
-    count = min(len(views), most_views)
+    count = min(len(views), VIEWS[coarse])
     local = np.concatenate(parallel_map(points_in, [views[k * len(views) // count] for k in range(count)]))
     keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T + MARGIN), dims)
     filled = np.bincount(keys, minlength=math.prod(dims)) > 0
@@ -104,7 +102,7 @@ def follow_surface(
     normals = _normals(moments, numbers, cells, _steps(dims, 1))
     numbers = np.full(len(numbers), -1, np.int32)
     numbers[cells] = np.arange(len(points))
-    edge = (np.abs(points) > half - seeds * box.size).any(1)
+    edge = (np.abs(points) > half - SEEDS[coarse] * box.size).any(1)
     reached = edge & ~in_region(region, box.center + points @ box.axes.T)
     planes = np.concatenate([points, normals], axis=1)
     _grow(numbers, cells, _steps(dims, 1), _steps(dims, MARGIN), points, normals, STEP * cell, reached, planes)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from ..solvers.kriging import foretell, variogram
 from .charts import Chart, Hits
 from .masks import ViewMasks
 from .propagate import Reference
-from .witness import Says, Witness, ask
+from .witness import Says, Witness, ask, spread
 
 VIEWS = 8  # that are looked at, spread evenly
 POINTS = 24_000  # pixels of the object in these views
@@ -37,35 +38,32 @@ LEAST_ERROR = 1.0  # of 8-bit pictures
 HALF = 9.0  # times the error of the surroundings that scores ½ when it is added: 10 dB worse
 GOOD, FAIR = 0.75, 0.5  # scores
 FINE = 2.0  # px, σ of the blur that leaves no detail
+OTHER_DETAIL = "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed"
 SOUND = (  # figures of the verdict, between which values nothing is amiss, and words for what is
     ("open_share", 0, 0.02, "{:.0%} of the hole is open: add views from other sides, or take the preset best"),
     ("remains", 0, 0.05, "{:.0%} of the object's place still looks like it: enlarge the box until all of it is inside"),
     ("haze", 0, 0.05, "haze covers {:.0%} of what was behind the object: enlarge the box, or add one round the haze"),
     ("ring_fidelity", -0.5, math.inf, "the surroundings lost {:.1f} dB against the photos: make the box tighter"),
-    (
-        "sharpness",
-        0.5,
-        2,
-        "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed",
-    ),
+    ("sharpness", 0.5, 2, OTHER_DETAIL),
     ("agreement", 0.7, 1, "only {:.0%} of the object's place looks as photos show it: mark shadows and reflections"),
     ("invented", 0, 0.3, "no photo shows {:.0%} of the object's place: paint one view if the fill does not convince"),
 )
+Told = float | None  # None: nothing tells
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the removal is worth (docs/method.md, the verdict). None: there is nothing that tells."""
+    """What the removal is worth (docs/method.md, the verdict), and what its figures mean."""
 
     score: float  # 0 bad … 1 good
-    open_share: float  # of the hole's pixels
-    remains: float  # share of the object's pixels that still look like it
-    haze: float | None  # blend weight before the charts, mean over the object's pixels
-    ring_fidelity: float | None  # dB, PSNR against photos round the object: after less before
-    sharpness: float | None  # detail of what was filled over that of its surroundings
-    agreement: float | None  # share of the object's pixels that look as photos, or other views, show the place
-    invented: float  # share of the object's pixels that nothing tells
-    expected_error: float  # dB by which the object's pixels are worse than the surroundings were
+    open_share: Annotated[float, "share of the hole that stays open"]
+    remains: Annotated[float, "share of the object's pixels that still look like it"]
+    haze: Annotated[Told, "blend weight before the surface behind the object"]
+    ring_fidelity: Annotated[Told, "dB that the surroundings gained or lost against photos"]
+    sharpness: Annotated[Told, "detail of what was filled over that of its surroundings"]
+    agreement: Annotated[Told, "share of the object's pixels that look as photos, or other views, show the place"]
+    invented: Annotated[float, "share of the object's pixels that no photo and no picture shows"]
+    expected_error: Annotated[float, "dB by which the object's pixels are probably worse than its surroundings were"]
     words: tuple[str, ...]
 
 
@@ -85,8 +83,7 @@ class _Look:
     error: float  # mean squared error before the removal in as many pixels round the object as it has
 
 
-@dataclass(frozen=True)
-class _Sample:
+class _Sample(NamedTuple):
     """Pixels of looks' every n-th row and column, [N]: the object's, and beside it those whose colours are told."""
 
     object: np.ndarray  # bool, of the object; the others lie beside it
@@ -98,7 +95,6 @@ class _Sample:
     variance: np.ndarray  # of true colours about those that are expected
     points: np.ndarray  # [N, 3]
     drawn: np.ndarray  # [N, 3] float32, grey levels
-    look: np.ndarray  # whose pixel it is
 
     @property
     def unseen(self) -> np.ndarray:
@@ -113,9 +109,9 @@ def judge(
     still_open: Sequence[np.ndarray],  # [H, W] bool each: what no reference reached
     photos: Mapping[str, np.ndarray],  # ID → [H, W, 3] uint8, with the object, at the splats' exposure
     photographed: Collection[str],  # IDs of those that are photos; others are drawn
-    charts: Sequence[Chart] = (),
-    hits: Mapping[str, Hits] | None = None,  # by ID
-    given: Reference | None = None,  # that a picture was given for
+    charts: Sequence[Chart],
+    hits: Mapping[str, Hits],  # by ID
+    given: Reference | None,  # that a picture was given for
 ) -> Verdict | None:
     """What a few views, drawn near the object, tell of a removal; None if no view shows the object."""
     asked = [v for v in views if v.camera.id in photographed] or list(views)
@@ -124,7 +120,6 @@ def judge(
     showing = [v for v in asked if v.silhouette.any()]
     if not showing:
         return None
-    count = min(VIEWS, len(showing))
 
     def look(view: ViewMasks) -> _Look:
         photo = photos[view.camera.id].astype(np.float32)
@@ -138,31 +133,27 @@ def judge(
         weights = drawing(final, view.camera, with_colour=False, pixels=near)
         depth, haze = weights.surface_depth()[0], weights.footprint(floats)
         chart, off = np.zeros((2, *near.shape), np.float32)
-        met = (hits or {}).get(view.camera.id)
-        if met is not None:
-            chart = met.depth
-            for number, height in enumerate(unsure):
-                on = (met.depth > 0) & (met.chart == number)
-                off[on] = height[met.rows[on], met.cols[on]]
+        if met := hits.get(view.camera.id):
+            chart, off = met.depth, met.of(unsure)
         return _Look(view, photo, ring, before, after, depth, chart, off, haze, error)
 
-    looks = parallel_map(look, [showing[k * len(showing) // count] for k in range(count)])
+    looks = parallel_map(look, spread(showing, VIEWS))
     total = sum(int(look.view.silhouette.sum()) for look in looks)
     step = max(1, round(math.sqrt(total / POINTS)))
     tolerance = max([c.tolerance for c in charts], default=SAME_DEPTH)
-    parts = parallel_map(lambda k: _sampled(looks, k, step, witnesses, tolerance, given), range(count))
-    sample = _Sample(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Sample)))
+    parts = parallel_map(lambda look: _sampled(look, step, witnesses, tolerance, given), looks)
     open_share = sum(int(m.sum()) for m in still_open) / max(1, sum(int(v.target.sum()) for v in views))
-    return _summed(looks, sample, open_share, bool(photographed), bool(charts))
+    return _summed(looks, parts, open_share, bool(photographed), bool(charts))
 
 
 def _summed(
-    looks: Sequence[_Look], sample: _Sample, open_share: float, with_photos: bool, with_charts: bool
+    looks: Sequence[_Look], parts: Sequence[_Sample], open_share: float, with_photos: bool, with_charts: bool
 ) -> Verdict:
+    sample = _Sample(*map(np.concatenate, zip(*parts)))
     error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
     before = _mean(*(_squared(look.before, look.photo)[look.ring] for look in looks))
     after = _mean(*(_squared(look.after, look.photo)[look.ring] for look in looks))
-    added, alike = _added_error(sample), _alike(looks, sample)
+    added, alike = _added_error(sample), _alike(looks, parts, sample)
     verdict = Verdict(
         score=1 / (1 + added / (HALF * error)),
         open_share=open_share,
@@ -192,7 +183,7 @@ def _added_error(sample: _Sample) -> float:
     return float(np.average(errors, weights=[int(where.sum()) for where in (photo, picture, unseen)]))
 
 
-def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
+def _alike(looks: Sequence[_Look], parts: Sequence[_Sample], sample: _Sample) -> np.ndarray:
     """[N] bool: pixels of the object that differ from photos, else from other views, as is usual round it."""
     usual = sample.usual[~sample.object]
     limit = max(LEAST_ERROR, float(np.percentile(usual, 95)) if len(usual) else 0.0)
@@ -201,15 +192,15 @@ def _alike(looks: Sequence[_Look], sample: _Sample) -> np.ndarray:
         for look in looks
     ]
     found = [sample.missed[sample.object & sample.told] <= limit]
-    for k in range(len(looks)):
-        own = sample.unseen & (sample.look == k)
-        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], sample.points[own])
-        found.append((_squared(sample.drawn[own], colours) <= limit)[seen])
+    for k, part in enumerate(parts):
+        colours, seen = shown([*drawn[:k], *drawn[k + 1 :]], part.points[part.unseen])
+        found.append((_squared(part.drawn[part.unseen], colours) <= limit)[seen])
     return np.concatenate(found)
 
 
 def _witness(camera: Camera, picture: np.ndarray, hidden: np.ndarray, depth: np.ndarray) -> Witness:
-    return Witness(camera, picture, hidden, np.zeros_like(hidden), depth)
+    no = np.zeros_like(hidden)
+    return Witness(camera, picture, hidden, no, no, depth)
 
 
 def _squared(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -223,7 +214,7 @@ def _mean(*parts: np.ndarray) -> float:
     return float(all_.mean(dtype=np.float64)) if len(all_) else 0.0
 
 
-def _sharpness(looks: Sequence[_Look]) -> float | None:
+def _sharpness(looks: Sequence[_Look]) -> Told:
     """Median detail of what was filled, over that of the same surfaces round the object."""
     filled, beside = [], []
     for look in looks:
@@ -239,10 +230,10 @@ def _sharpness(looks: Sequence[_Look]) -> float | None:
 
 
 def _sampled(
-    looks: Sequence[_Look], k: int, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
+    look: _Look, step: int, witnesses: Sequence[Witness], tolerance: float, given: Reference | None
 ) -> _Sample:
-    look, thin = looks[k], np.s_[::step, ::step]
-    camera, object_ = look.view.camera, look.view.silhouette[thin]
+    thin, camera = np.s_[::step, ::step], look.view.camera
+    object_ = look.view.silhouette[thin]
     ring, photo, after, depth, chart = (a[thin] for a in (look.ring, look.photo, look.after, look.depth, look.chart))
     others = [w for w in witnesses if w.camera.id != camera.id]
     centres = camera.pixel_centres()[thin]
@@ -262,8 +253,8 @@ def _sampled(
         depth_given = np.where(given.target, given.depth, 0)
         by_picture[left] = sees(given.camera, depth_given, points[left], tolerance)
         expected[by_picture] = colours_at(given.image, given.camera.project(points[by_picture])[0])
-    foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~object_ | told | by_picture)
     unknown = object_ & ~told & ~by_picture
+    foretold, variance, lags = foretell(np.where(object_[..., None], expected, photo), ~unknown)
     expected[unknown] = foretold[unknown]
     if given is not None:
         here, there = points - camera.centre, points - given.camera.centre
@@ -277,7 +268,7 @@ def _sampled(
     remains = object_ & along & (_squared(photo, expected) > UNLIKE**2)
     errors = (_squared(drawn, expected) for drawn in (look.before[thin], after))
     kept = object_ | (ring & told)
-    maps = object_, told, by_picture, remains, *errors, variance, points, after, np.full(kept.shape, k)
+    maps = object_, told, by_picture, remains, *errors, variance, points, after
     return _Sample(*(m[kept] for m in maps))
 
 
@@ -316,10 +307,9 @@ def _floating(gaussians: Gaussians, charts: Sequence[Chart], witnesses: Sequence
         there, nearer = chart.there[rows, cols], z < chart.depth[rows, cols] - SCATTER * chart.noise
         before[index] |= there & nearer
         other[index] |= there & ~nearer
-    rows = np.flatnonzero(before & ~other & gaussians.usable)
-    said = ask(witnesses, points[rows], max([c.tolerance for c in charts], default=SAME_DEPTH))
-    found = np.zeros(len(points), bool)
-    found[rows] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
+    found = before & ~other & gaussians.usable
+    said = ask(witnesses, points[found], max([c.tolerance for c in charts], default=SAME_DEPTH))
+    found[found] = (said == Says.HIDDEN).any(0) & ~np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     return found
 
 

@@ -1,4 +1,7 @@
-"""What the photos say of points in space: which show them, in which the object hides them, and how alike they look."""
+"""What the photos say of points in space: which show them, in which the object hides them, and how alike they look.
+
+And one picture of a surface from all photos that show it.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,18 @@ import cv2
 import numpy as np
 
 from ..camera import Camera
-from ..compute.jit import exact_kernel
+from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.threads import parallel_map, run_ranges
 from ..geometry import Window, cropped, pack_camera, project
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
-LOUD = 127  # grey levels beyond which a difference counts no more; kept as int8
+LOUDEST = 127  # grey levels beyond which a difference counts no more; kept as int8
 AT_ONCE = 8  # views whose results are in memory together
 SUBPIXEL = 256  # steps of a pixel in which photos are read
 AGREEING = 3  # photos that must show a point for their agreement to be asked
+SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say
+FEW = 12.0  # grey levels by which a photo may always differ from what most say
+LOUD = 3.0  # times the spread of textures, by which its detail may besides: more is the edge of something before it
 
 T = TypeVar("T")
 
@@ -35,9 +41,6 @@ class Says(IntEnum):
     BESIDE = 5  # it lies on the surface shown, but right beside the object: the pixel may show both
 
 
-NOTHING, SEEN, HIDDEN, BEHIND, THROUGH, BESIDE = 0, 1, 2, 3, 4, 5  # the same, for the kernels
-
-
 @dataclass(frozen=True)
 class Witness:
     """A view as evidence."""
@@ -46,11 +49,17 @@ class Witness:
     photo: np.ndarray  # [H, W, 3] uint8
     hidden: np.ndarray  # [H, W] bool, where the photo shows the object
     beside: np.ndarray  # [H, W] bool, where it may show some of it
+    veiled: np.ndarray  # [H, W] bool, where the scene draws no solid surface, or what stands before the object
     depth: np.ndarray  # [H, W] float32 z of the scene with the object, 0 = nothing
 
     def cropped(self, window: Window) -> Witness:
-        maps = (np.ascontiguousarray(a[window]) for a in (self.photo, self.hidden, self.beside, self.depth))
-        return Witness(cropped(self.camera, window), *maps)
+        maps = (self.photo, self.hidden, self.beside, self.veiled, self.depth)
+        return Witness(cropped(self.camera, window), *(np.ascontiguousarray(m[window]) for m in maps))
+
+    @property
+    def depth_beside(self) -> np.ndarray:
+        """[H, W] z of the solid surfaces beside the object; 0 elsewhere."""
+        return np.where(self.hidden | self.veiled, 0, self.depth)
 
 
 def ask(witnesses: Sequence[Witness], points: np.ndarray, tolerance: float) -> np.ndarray:
@@ -67,6 +76,12 @@ def ask(witnesses: Sequence[Witness], points: np.ndarray, tolerance: float) -> n
         return said
 
     return np.array(parallel_map(of, witnesses), np.uint8).reshape(len(witnesses), len(points))
+
+
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """As many of the items, evenly."""
+    count = min(most, len(items))
+    return [items[k * len(items) // count] for k in range(count)]
 
 
 def total_over(items: Sequence[T], work: Callable[[T], np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
@@ -87,13 +102,13 @@ def _ask_range(lo, hi, points, c, hidden, beside, depth, tolerance, said):
         row, col = int(v), int(u)
         front = depth[row, col]
         if hidden[row, col]:
-            said[i] = HIDDEN
+            said[i] = Says.HIDDEN
         elif 0 < front < (1 - tolerance) * z:
-            said[i] = BEHIND
+            said[i] = Says.BEHIND
         elif front > (1 + tolerance) * z or front == 0:
-            said[i] = THROUGH
+            said[i] = Says.THROUGH
         else:
-            said[i] = BESIDE if beside[row, col] else SEEN
+            said[i] = Says.BESIDE if beside[row, col] else Says.SEEN
 
 
 def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -107,7 +122,7 @@ def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
         total = cv2.GaussianBlur(grey * weight, (0, 0), sigma)
         return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
 
-    return np.clip(np.rint(2 * (blurred(FINE) - blurred(COARSE))), -LOUD, LOUD).astype(np.int8)
+    return np.clip(np.rint(2 * (blurred(FINE) - blurred(COARSE))), -LOUDEST, LOUDEST).astype(np.int8)
 
 
 @dataclass(frozen=True)
@@ -121,7 +136,6 @@ class Textures:
     @classmethod
     def make(cls, witnesses: Sequence[Witness], most: int = 32, shrink: int = 1) -> Textures:
         """Of `most` views, evenly chosen, in pictures smaller by a whole factor."""
-        count = min(len(witnesses), most)
 
         def of(witness: Witness) -> tuple[np.ndarray, np.ndarray]:
             hidden = witness.hidden | witness.beside  # the object's edge is no texture of what is beside it
@@ -134,8 +148,7 @@ class Textures:
             camera[16:] = w, h
             return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
 
-        used = [witnesses[k * len(witnesses) // count] for k in range(count)]
-        cameras, values = zip(*parallel_map(of, used))
+        cameras, values = zip(*parallel_map(of, spread(witnesses, most)))
         sizes = np.array([len(v) for v in values], np.int64)
         return cls(np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
 
@@ -145,14 +158,10 @@ class Textures:
         Σ n m² / Σ t² over points that at least three photos show, t a photo's value there, m their mean. It is
         greatest where the points lie on the real surface (plane sweep: Collins 1996).
         """
-        common, total = self.energy(points).sum(0)
-        return float(common / total) if total > 0 else 0.0
-
-    def energy(self, points: np.ndarray) -> np.ndarray:
-        """[N, 2]: what the photos have in common at each point, n m², and all they show there, Σ t²."""
         energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
         run_ranges(_compare_range, len(points), points, self.cameras, self.starts, self.values, AGREEING, energy)
-        return energy
+        common, total = energy.sum(0)
+        return float(common / total) if total > 0 else 0.0
 
 
 @exact_kernel  # points may be NaN
@@ -182,3 +191,102 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
         if count >= least:
             energy[i, 0] = total * total / count
             energy[i, 1] = squares
+
+
+def mosaic(
+    points: np.ndarray,  # [H, W, 3] scene coordinates of its texels
+    normal: np.ndarray,  # [3] unit
+    witnesses: Sequence[Witness],
+    said: np.ndarray,  # [V, H, W], see ask
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[H, W, 3] uint8: colours that most photos agree on, as sharp as the photo that shows the place best; 0 of none.
+
+    And by how much photos' textures differ round each texel, [H, W] float32 grey levels, the median over photos: things
+    that do not lie on the surface show another texture in each, whatever the light. And how loud the texture is that
+    most of them show, likewise: a loud one differs more where photos are a little misplaced.
+
+    Where photos disagree, the median of each channel decides. As misplaced photos blur its detail, that comes from one
+    photo at a time, brought to the median's colours by a smooth correction: the one with most pixels there of those
+    that need little of it. So no seam shows between photos (two bands of Burt & Adelson 1983).
+    """
+    h, w = points.shape[:2]
+    clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do
+    told = np.where(clear, said == Says.SEEN, said == Says.BESIDE)
+    flat = points.reshape(-1, 3)
+
+    def of(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        c = witnesses[k].camera
+        uv, z = c.project(points)
+        x, y = (np.nan_to_num(uv, nan=-1e4).astype(np.float32) - 0.5).transpose(2, 0, 1)
+        sample = cv2.remap(witnesses[k].photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        towards = c.centre - flat
+        cosine = towards @ normal / np.linalg.norm(towards, axis=1)
+        density = np.where(told[k].ravel(), np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
+        density = (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
+        return sample.reshape(-1, 3), texture(sample, told[k]).ravel(), density
+
+    parts = parallel_map(of, range(len(witnesses)))
+    samples, textures, density = (np.array([p[k] for p in parts]) for k in range(3))
+    middle, (spread, loud) = np.zeros((h * w, 3), np.float32), np.zeros((2, h * w), np.float32)
+    run_ranges(_agree_range, h * w, samples, textures, density, middle, spread, loud)
+    several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
+    spread, loud = (_smooth(a.reshape(h, w, 1), several)[..., 0] for a in (spread, loud))
+
+    def correction(k: int) -> np.ndarray:
+        off = _smooth((middle - samples[k]).reshape(h, w, 3), told[k])
+        return np.clip(np.rint(off), -128, 127).astype(np.int8).reshape(-1, 3)
+
+    corrections = np.array(parallel_map(correction, range(len(witnesses))))
+    picture = middle.copy()
+    run_ranges(_choose_range, h * w, samples, corrections, density, middle, FEW, FEW + LOUD * spread.ravel(), picture)
+    return np.clip(np.rint(picture), 0, 255).reshape(h, w, 3).astype(np.uint8), spread, loud
+
+
+def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    weight = shown.astype(np.float32)
+    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), SEAM).reshape(picture.shape)
+    return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), SEAM), 1e-3)[..., None]
+
+
+@exact_kernel
+def _agree_range(lo, hi, samples, textures, density, middle, spread, loud):
+    values = np.empty(len(samples))
+    for i in range(lo, hi):
+        for channel in range(4):  # the fourth is texture
+            count = 0
+            for k in range(len(samples)):
+                if density[k, i] > 0:
+                    values[count] = samples[k, i, channel] if channel < 3 else textures[k, i]
+                    count += 1
+            if count == 0:
+                break
+            part = np.sort(values[:count])
+            if channel < 3:
+                middle[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
+            else:
+                loud[i] = 0.5 * abs(part[count // 2])
+                spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
+
+
+@exact_kernel
+def _choose_range(lo, hi, samples, corrections, density, middle, few, loud, picture):
+    for i in range(lo, hi):
+        least, largest = 127.0, 0.0
+        for k in range(len(samples)):  # the nearest to the median always agrees
+            if density[k, i] > 0:
+                least = min(least, _most(corrections, k, i))
+        for k in range(len(samples)):
+            if not density[k, i] > largest or _most(corrections, k, i) > max(few, least):
+                continue
+            off = 0.0
+            for channel in range(3):
+                off = max(off, abs(samples[k, i, channel] + corrections[k, i, channel] - middle[i, channel]))
+            if off <= loud[i]:
+                largest = density[k, i]
+                for channel in range(3):
+                    picture[i, channel] = samples[k, i, channel] + corrections[k, i, channel]
+
+
+@inline_kernel
+def _most(corrections, k, i):
+    return max(abs(float(corrections[k, i, 0])), abs(float(corrections[k, i, 1])), abs(float(corrections[k, i, 2])))

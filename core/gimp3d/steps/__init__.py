@@ -1,1 +1,1 @@
-"""A removal's steps: stages put together over all views (view_state.ViewState); pipeline.py runs them in order."""
+"""A removal's steps: stages put together over all views (run.ViewState); pipeline.py runs them in order."""

@@ -18,26 +18,28 @@ import numpy as np
 from ..box import Region
 from ..errors import IllPosed
 from ..gaussians import SH_C0, Gaussians
+from ..geometry import SOLID
 from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
-from ..stages.charts import Chart, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
-from ..stages.clearing import Targets, chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
-from ..stages.ground import look_at
+from ..run import ViewState
+from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
+from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
+from ..stages.ground import look_at, support_first
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
-from ..stages.masks import Masks
-from ..stages.occluder import support_first
+from ..stages.masks import Masks, ViewMasks
 from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.reflection import Reflection, find_reflection
 from ..stages.seed import OWN_RULES
 from ..stages.selection import Selection, near_region
 from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
 from ..stages.witness import Witness, total_over
-from ..view_state import ViewState
 from .references import emptied
 
-NO_SHADOW = {"found": False, "lights": [], "explained": 0.0}
-NO_REFLECTION = {"found": False, "explained": 0.0}
+NOTHING: dict[str, dict[str, Any]] = {
+    "shadow": {"found": False, "lights": [], "explained": 0.0},
+    "reflection": {"found": False, "explained": 0.0},
+}
 LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them (kitchen_monkey −0.2 dB, real_bed −0.1)
 ROUND = 24  # px round the object in which photos teach
 PLACE, ELSEWHERE = 1, 2  # labels of a view's pixels: the object's place, and all others
@@ -56,16 +58,17 @@ class Surfaces:
     planes: tuple[Plane, ...]
     laid: tuple[Laid, ...]  # those of which the object hides something
     selection: Selection  # without what photos show to be surface
-    objects: tuple[tuple[np.ndarray, np.ndarray], ...]  # see object_pixels
+    objects: Sequence[tuple[np.ndarray, np.ndarray]]  # see object_pixels
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
     reason: str
 
     def witnesses(self, views: Sequence[ViewState]) -> list[Witness]:
-        return [
-            Witness(v.camera, v.bare, hidden | marked, beside, v.masks.depth_before)
-            for v, (hidden, beside), marked in zip(views, self.objects, self.marked)
-        ]
+        found = []
+        for v, (hidden, beside), marked in zip(views, self.objects, self.marked):
+            veiled = (v.masks.alpha_before < SOLID) | v.masks.occluder
+            found.append(Witness(v.camera, v.bare, hidden | marked, beside, veiled, v.masks.depth_before))
+        return found
 
     def with_marked(self, more: Sequence[np.ndarray]) -> Surfaces:
         return replace(self, marked=tuple(a | b for a, b in zip(self.marked, more)))
@@ -85,26 +88,25 @@ def find_surfaces(
         raise IllPosed("the object hides everything in every view: nothing is left to fill from, add views")
     # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
-    objects = tuple(object_pixels(scene, masks.removed, masks.views, settings.clearing))
-    rough = Surfaces((), (), masks.selection, objects, marked, 1.0, "")
-    witnesses = rough.witnesses(views)
-    planes = find_planes(masks.views, witnesses, region, settings.charts, settled)
-    laid = lay_planes(planes, masks.views, witnesses, region, settings.charts)
-    reason = f"{len(planes)} planes run into what the object hid"
-    found = replace(rough, planes=planes, laid=laid, reason=reason)
-    sunk = sunk_rows(scene, masks.selection, laid)
-    if not len(sunk):
-        return found
 
     def hidden_by(removed: np.ndarray) -> Surfaces:
-        return replace(found, objects=tuple(object_pixels(scene, removed, masks.views, settings.clearing)))
+        objects = object_pixels(scene, removed, masks.views, settings.clearing)
+        return Surfaces((), (), masks.selection, objects, marked, 1.0, "")
 
-    standing = masks.removed
-    standing[sunk] = False
-    charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
-    selection = with_surface(masks.selection, scene, sunk, charts)
-    reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
-    return replace(hidden_by(selection.removed), selection=selection, reason=reason)
+    found, selection = hidden_by(masks.removed), masks.selection
+    witnesses = found.witnesses(views)
+    planes = find_planes(witnesses, region, settings.charts, settled)
+    laid = lay_planes(planes, witnesses, region, settings.charts)
+    reason = f"{len(planes)} planes run into what the object hid"
+    sunk = sunk_rows(scene, masks.selection, laid)
+    if len(sunk):
+        standing = masks.removed
+        standing[sunk] = False
+        charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
+        selection = with_surface(masks.selection, scene, sunk, charts)
+        reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
+        found = hidden_by(selection.removed)
+    return replace(found, planes=planes, laid=laid, selection=selection, reason=reason)
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class Charted:
 
     charts: tuple[Chart, ...]
     selection: Selection  # with what had to be cleared away
-    targets: Targets
+    targets: Sequence[tuple[ViewMasks, Hits]]  # see chart_targets
     confidence: float
     reason: str
 
@@ -125,21 +127,22 @@ def chart_surfaces(
     witnesses, marked, masks = surfaces.witnesses(views), surfaces.marked, [v.masks for v in views]
     charts = draw_charts(surfaces.laid, witnesses, region, marked)
     if not charts:
-        return Charted((), surfaces.selection, Targets((), ()), 0.0, "no surface runs into what the object hid")
-    tolerance, witnesses = max(c.tolerance for c in charts), hiding_rests(witnesses, charts)
-    selection = clear_air(scene, region, surfaces.selection, masks, witnesses, charts, settings.clearing)
-    targets = chart_targets(scene, selection, masks, witnesses, charts, tolerance, marked, settings.clearing)
+        return Charted((), surfaces.selection, (), 0.0, "no surface runs into what the object hid")
+    witnesses = hiding_rests(witnesses, charts)
+    selection = clear_air(scene, region, surfaces.selection, witnesses, charts, settings.clearing)
+    targets = chart_targets(scene, selection, masks, witnesses, charts, marked)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     cleared = int((selection.removed & ~surfaces.selection.removed).sum())
     return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the object does to the light round it; in words, why it seems to do nothing."""
+class Relit:
+    """What the object does to the light round it; in words, why it seems to do nothing. Undone, once it is lifted."""
 
     reflection: Reflection | str
     shadow: Shadow | str
+    lifted: Lifted | None = None
 
     @property
     def effects(self) -> list[Reflection | Shadow]:
@@ -153,66 +156,17 @@ class Found:
     def reason(self) -> str:
         return "; ".join(f if isinstance(f, str) else f.reason for f in (self.shadow, self.reflection))
 
-
-def find_light(
-    scene: Gaussians,
-    region: Region,
-    surfaces: Surfaces,
-    views: Sequence[ViewState],
-    shadow_masks: Mapping[str, np.ndarray],  # ID → [H, W] bool, the shadow as the user marked it
-    settings: RemovalSettings,
-) -> Found:
-    """Look for the object's reflection, and in photos without that for its shadow."""
-    gone, masks = scene.take(surfaces.selection.removed), [v.masks for v in views]
-    planes = support_first(surfaces.planes, gone)
-    if not planes:
-        none = "no surface is known round the object"
-        return Found(f"no reflection found: {none}", f"no shadow found: {none}")
-    witnesses: Sequence[Witness] = surfaces.witnesses(views)
-    grounds = look_at(planes, masks, witnesses, region)
-    reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
-    if isinstance(reflection, Reflection):
-        bare = bare_photos(reflection, witnesses)
-        witnesses = [replace(w, photo=photo) for w, (photo, *_) in zip(witnesses, bare)]
-        grounds = look_at(planes, masks, witnesses, region)
-    if settings.shadow == "mask":
-        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
-    else:
-        shadow = find_shadow(gone, planes[0], grounds, region)
-    return Found(reflection, shadow)
-
-
-def undo_light(scene: Gaussians, surfaces: Surfaces, views: Sequence[ViewState], found: Found) -> Lifted:
-    """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
-    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, found.shadow)
-
-
-def with_contact(found: Found, charts: Sequence[Chart]) -> Found:
-    """The same with the shadow where the object touches a surface: where none of a lamp was found."""
-    shadow = find_contact(charts)
-    return replace(found, shadow=f"{found.shadow}; {shadow}" if isinstance(shadow, str) else shadow)
-
-
-@dataclass(frozen=True)
-class Relit:
-    """What the object does to the light round it, undone as far as it is found."""
-
-    found: Found
-    lifted: Lifted | None
-
-    @property
-    def shadow(self) -> dict[str, Any]:
-        """See Shadow.facts."""
-        return _facts(self.found.shadow, NO_SHADOW)
-
-    @property
-    def reflection(self) -> dict[str, Any]:
-        """See Reflection.facts."""
-        return _facts(self.found.reflection, NO_REFLECTION)
+    def facts(self) -> dict[str, Any]:
+        """For the summary, by name: see Shadow.facts and Reflection.facts."""
+        found = {"shadow": self.shadow, "reflection": self.reflection}
+        return {
+            name: {**NOTHING[name], "reason": f} if isinstance(f, str) else {**f.facts(), "reason": f.reason}
+            for name, f in found.items()
+        }
 
     def scene(self, scene: Gaussians) -> Gaussians:
         """The scene in its new light."""
-        return scene if self.lifted is None else self.lifted.scene(scene)
+        return scene if self.lifted is None else scene.with_rows(self.lifted.rows, self.lifted.gaussians)
 
     @property
     def rows(self) -> np.ndarray:
@@ -225,17 +179,47 @@ class Relit:
             return tuple(views)
         return tuple(replace(v, bare=photo, painted=photo) for v, photo in zip(views, self.lifted.photos))
 
-    def shaded(self, number: int) -> np.ndarray | bool:
-        """[H, W] bool: where a view, by its index, changed."""
-        return False if self.lifted is None else self.lifted.shaded[number]
+
+NOT_LIT = Relit("not looked for", "not looked for")
 
 
-def _facts(found: Reflection | Shadow | str, none: dict[str, Any]) -> dict[str, Any]:
-    """For the summary."""
-    return {**none, "reason": found} if isinstance(found, str) else {**found.facts(), "reason": found.reason}
+def find_light(
+    scene: Gaussians,
+    region: Region,
+    surfaces: Surfaces,
+    views: Sequence[ViewState],
+    shadow_masks: Mapping[str, np.ndarray],  # ID → [H, W] bool, the shadow as the user marked it
+    settings: RemovalSettings,
+) -> Relit:
+    """Look for the object's reflection, and in photos without that for its shadow."""
+    gone = scene.take(surfaces.selection.removed)
+    planes = support_first(surfaces.planes, gone)
+    if not planes:
+        none = "no surface is known round the object"
+        return Relit(f"no reflection found: {none}", f"no shadow found: {none}")
+    witnesses: Sequence[Witness] = surfaces.witnesses(views)
+    grounds = look_at(planes, witnesses, region)
+    reflection = find_reflection(gone, planes[0], grounds, witnesses, region)
+    if isinstance(reflection, Reflection):
+        bare = bare_photos(reflection, witnesses)
+        witnesses = [replace(w, photo=photo) for w, (photo, *_) in zip(witnesses, bare)]
+        grounds = look_at(planes, witnesses, region)
+    if settings.shadow == "mask":
+        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
+    else:
+        shadow = find_shadow(gone, planes[0], grounds, region)
+    return Relit(reflection, shadow)
 
 
-NOT_LIT = Relit(Found("not looked for", "not looked for"), None)
+def undo_light(scene: Gaussians, surfaces: Surfaces, views: Sequence[ViewState], found: Relit) -> Lifted:
+    """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
+    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, found.shadow)
+
+
+def with_contact(found: Relit, charts: Sequence[Chart]) -> Relit:
+    """The same with the shadow where the object touches a surface: where none of a lamp was found."""
+    shadow = find_contact(charts)
+    return replace(found, shadow=f"{found.shadow}; {shadow}" if isinstance(shadow, str) else shadow)
 
 
 @dataclass(frozen=True)
@@ -246,13 +230,6 @@ class Relearned:
     gaussians: Gaussians  # [M], their new values
     confidence: float
     reason: str
-
-    def scene(self, scene: Gaussians) -> Gaussians:
-        """The scene with them."""
-        arrays = {name: getattr(scene, name).copy() for name in LEARNED}
-        for name in LEARNED:
-            arrays[name][self.rows] = getattr(self.gaussians, name)
-        return replace(scene, **arrays)
 
 
 def relearn(
@@ -296,8 +273,8 @@ def take_painted_colours(kept: Gaussians, added: Gaussians, views: Sequence[View
     wanted = [np.isin(v.rules, OWN_RULES) for v in views if v.rules is not None]
     views = [v for v in views if v.rules is not None]
     hidden = [(v.masks.silhouette | v.masks.target) & ~own for v, own in zip(views, wanted)]
-    witnesses = [Witness(v.camera, v.painted, h, np.zeros_like(h), v.masks.depth_before) for v, h in zip(views, hidden)]
-    whole, painted = kept.extended(added), [v.painted for v in views]
+    no, whole, painted = [np.zeros_like(h) for h in hidden], kept.extended(added), [v.painted for v in views]
+    witnesses = [Witness(v.camera, v.painted, h, n, n, v.masks.depth_before) for v, h, n in zip(views, hidden, no)]
     may = (np.arange(len(whole)) < len(kept)) & whole.usable & np.isfinite(whole.opacity_logits)
     rows, sh = recoloured(whole, np.zeros(len(whole), bool), witnesses, painted, wanted, wanted, 0, may)
     seen = np.abs(sh[:, 0] - kept.sh[rows, 0]).max(1) > VISIBLE / SH_C0

@@ -1,7 +1,7 @@
 """References without the object: which comes next, its depth and picture, and how it is carried into all views.
 
 A completed reference is tiled with Gaussians; views are painted with it, and the Gaussians take the colours that views
-were painted with. What no reference reaches stays open. A painter that the user named may refine painted views.
+were painted with. What no reference reaches stays open.
 """
 
 from __future__ import annotations
@@ -21,20 +21,17 @@ from ..gaussians import Gaussians
 from ..geometry import SOLID, colours_at, dilated, disparity_of, sees, window_mask
 from ..presets import RemovalSettings
 from ..priors.calls import Call
-from ..priors.inpaint import PROVIDERS, inpaint_reference, painter
-from ..priors.monodepth import depth_prior, looks
+from ..priors.inpaint import PROVIDERS, inpaint_reference
+from ..priors.monodepth import depth_prior
 from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
+from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
-from ..stages.mapping import MappingField, mapping_field, source_visibility
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
+from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
 from ..stages.reference import DepthCompletion, PriorFit, complete_depth, rim
-from ..stages.refine import looked_at
-from ..stages.seed import seed_gaussians, settle_gaussians
-from ..stages.view_refinement import ViewRefinement, ViewToRefine, refine_views
-from ..view_state import ViewState
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
@@ -66,10 +63,7 @@ def turns_of(
 ) -> list[Turn]:
     """In which order references are completed, as far as there is something left to fill.
 
-    Raises
-    ------
-    BadInput
-        If the chart that is named does not exist.
+    Raises BadInput if the chart that is named does not exist.
     """
     number, count = chart_number(reference), len(charts)
     if number is not None:
@@ -137,9 +131,8 @@ def paint_chart(chart: Chart, hole: np.ndarray, turn: Turn, settings: RemovalSet
     if turn.picture is not None:
         return paste_picture(chart.image, hole | chart.hole, turn.picture, "--reference-image", chart.known)
     of_another = settings.inpaint.startswith("file:") and turn.name is None
-    who, seed = "exemplar" if of_another else settings.inpaint, settings.random_seed
-    unknown = ~chart.known & ~hole
-    return inpaint_reference(who, chart.image, hole, seed, unknown=unknown, call=call, variant=settings.variant)
+    who, unknown = "exemplar" if of_another else settings.inpaint, ~chart.known & ~hole
+    return inpaint_reference(who, chart.image, hole, settings.random_seed, unknown, call, settings.variant)
 
 
 def complete_view_depth(
@@ -154,21 +147,16 @@ def complete_view_depth(
         there = view.hits.depth
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
-        words = f"{share:.0%} of the hole lies on charts"
-        return DepthCompletion(depth, share, words, PriorFit())
-    looked_at = None
+        return DepthCompletion(depth, share, f"{share:.0%} of the hole lies on charts", PriorFit())
+
+    def first_fill() -> np.ndarray:
+        return paint_view(replace(view, hits=None), (), replace(settings, variant=0), picture, ask).image
+
     spec = "auto" if settings.depth_prior.startswith("file:") and not first else settings.depth_prior
-    if looks(spec):
-        if picture is not None:
-            pasted = paste_picture(view.painted, masks.target, picture, "--reference-image", ~masks.silhouette)
-        else:
-            pasted = inpaint_reference(settings.inpaint, view.painted, masks.target, settings.random_seed, call=ask)
-        looked_at = pasted.image
-    prior = depth_prior(spec, masks.camera.height, masks.camera.width, looked_at, model)
+    prior = depth_prior(spec, masks.camera.height, masks.camera.width, first_fill, model)
     surface: Any = spec if spec in ("harmonic", "planar") else settings.depth.surface
-    depth_settings = replace(settings.depth, surface=surface)
-    known = rim(masks) & ~masks.occluder
-    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, depth_settings)
+    known, continued = rim(masks) & ~masks.occluder, replace(settings.depth, surface=surface)
+    return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, continued)
 
 
 def paint_view(
@@ -182,9 +170,8 @@ def paint_view(
         base = np.where(seen[..., None], shown, base)
     if picture is not None:
         return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
-    filled = inpaint_reference(
-        settings.inpaint, base, masks.target & ~seen, settings.random_seed, call=call, variant=settings.variant
-    )
+    hole, seed = masks.target & ~seen, settings.random_seed
+    filled = inpaint_reference(settings.inpaint, base, hole, seed, None, call, settings.variant)
     share = seen.sum() / max(1, masks.target.sum())
     return replace(filled, reason=f"{share:.0%} of the hole is seen in photos; {filled.reason}")
 
@@ -198,12 +185,6 @@ def emptied(kept: Gaussians, views: Sequence[ViewState]) -> tuple[ViewState, ...
         return replace(view, painted=np.where(silhouette[..., None], drawn, view.bare))
 
     return tuple(parallel_map(empty, views))
-
-
-def seed_surface(completed: Completed, surfels: bool, settings: RemovalSettings) -> Gaussians:
-    """Gaussians that tile the completed surface."""
-    c = completed
-    return seed_gaussians(c.camera, c.image, c.depth, c.target, surfels, settings.seed, c.camera.split == CHART)
 
 
 def map_reference(completed: Completed, views: Sequence[ViewState], settings: RemovalSettings) -> MappingField:
@@ -224,14 +205,11 @@ def paint_views(
 ) -> Propagation:
     """Every view with the completed reference in its hole."""
     loaders = [partial(_to_paint, v, completed.charts, with_seeds) for v in views]
-    sources = None if field is None else (field.rows, field.cols)
-    return propagate(completed, loaders, settings.propagate, progress, sources)
+    return propagate(completed, loaders, settings.propagate, progress, field)
 
 
 def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
-    """The view with the depth of its splats, the new ones among them; or with the charts', where its own is theirs or
-    none.
-    """
+    """The view with the depth of its splats, new ones too; or with the charts', where its own is theirs or none."""
     v = view.left
     before, after = v.depth_before, np.zeros_like(v.depth_before)
     if charts:
@@ -248,23 +226,8 @@ def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -
 
 
 def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarray:
-    """z [H, W], but a chart's [H, W] (0 = none) where both are the same surface, by a relative tolerance: splats'
-    depths are rough, photos place charts.
-    """
+    """z [H, W]; a chart's (0 = none) where they are within a share of it: splats' are rough, photos place charts."""
     return np.where((there > 0) & (np.abs(depth - there) < tolerance * there), there, depth)
-
-
-def settle_seeds(
-    completed: Completed,
-    seeds: Gaussians,
-    filled: Gaussians,  # the scene without the object and without the seeds
-    views: Sequence[ViewState],
-    painting: Propagation,
-    settings: RemovalSettings,
-) -> Gaussians:
-    """The seeds that are needed, in the colours of the painted views."""
-    looks = [(v.camera, paint) for v, paint in zip(views, painting.views)]
-    return settle_gaussians(filled, seeds, completed.camera, looks, settings.seed)
 
 
 def after_reference(
@@ -278,8 +241,11 @@ def after_reference(
     """The views with what a reference painted, and what of them it left open."""
 
     def after(view: ViewState, part: PaintedView) -> ViewState:
-        part, touched = _with_own_picture(part, completed), touched_window(new, view.camera)
-        rules = part.rule_map(*view.painted.shape[:2])
+        touched = touched_window(new, view.camera)
+        if view.id == completed.camera.id:  # it shows its completed picture, not a mapped one
+            rules = np.where(completed.target[part.part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
+            part = replace(part, image=completed.image[part.part], rules=rules)
+        rules = part.rule_map()
         coloured = (rules != Rule.UNTOUCHED) & (rules != Rule.UNREACHED)
         best = max(view.best or (0, completed), (int(coloured.sum()), completed), key=lambda found: found[0])
         told = rules if view.rules is None else np.where(coloured, rules, view.rules)
@@ -290,16 +256,6 @@ def after_reference(
         return replace(view, painted=picture, rules=told, best=best, left=left)
 
     return tuple(parallel_map(lambda pair: after(*pair), zip(views, painted)))
-
-
-def _with_own_picture(painted: PaintedView, completed: Completed) -> PaintedView:
-    """The painted view; the reference's own shows its completed picture, not a mapped one."""
-    if painted.camera_id != completed.camera.id:
-        return painted
-    h, w = painted.rules.shape
-    part = slice(painted.top, painted.top + h), slice(painted.left, painted.left + w)
-    rules = np.where(completed.target[part], Rule.EVIDENCE, Rule.UNTOUCHED).astype(np.uint8)
-    return replace(painted, image=completed.image[part], rules=rules)
 
 
 def redrawn(picture: np.ndarray, filled: Gaussians, view: ViewMasks, touched: Window) -> np.ndarray:
@@ -322,8 +278,7 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     What is left of the margin round T is closed where the scene's own surface joins the new one, and beside what is
     in front, where a splat's soft edge has the depth of neither.
     """
-    new = np.zeros(len(filled), bool)
-    new[len(filled) - added :] = True
+    new = np.arange(len(filled)) >= len(filled) - added
     around = np.ones((2 * MARGIN + 1,) * 2, np.uint8)
     scene = drawing(filled, view.camera, with_colour=False, pixels=touched | dilated(view.target, MARGIN))
     before, uncoloured = (view.depth_after, view.alpha_after), rules == Rule.UNREACHED
@@ -337,28 +292,3 @@ def still_open(view: ViewMasks, filled: Gaussians, added: int, rules: np.ndarray
     joined &= at_edge | (depth < (1 + LAYER_STEP) * farthest)
     wide = cv2.morphologyEx(target.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * MARGIN,) * 2, np.uint8)) > 0
     return replace(view, target=target & (wide | ~joined), depth_after=depth, alpha_after=alpha)
-
-
-def ask_to_refine(views: Sequence[ViewState], settings: RemovalSettings, call: Call) -> ViewRefinement:
-    """Ask the painter that the settings name about as many painted views as refinement looks at."""
-    asked = [
-        ViewToRefine(v.id, v.painted, v.rules, v.best[1].image, v.best[1].target)
-        for v in views
-        if v.rules is not None and v.best is not None
-    ]
-    who = painter(settings.refine_views, call)
-    return refine_views(who, looked_at(asked, settings.refine), settings.random_seed, call)
-
-
-def with_answers(views: Sequence[ViewState], asked: ViewRefinement) -> tuple[ViewState, ...]:
-    """The views with the answers that were accepted."""
-    answers = {a.camera_id: a.image for a in asked.views if a.image is not None}
-
-    def answered(view: ViewState) -> ViewState:
-        image = answers.get(view.id)
-        if image is None or view.rules is None:
-            return view
-        rules = np.where((image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
-        return replace(view, painted=image, rules=rules)
-
-    return tuple(map(answered, views))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from structured import edge_error, structured
 
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.solvers.exemplar import complete_picture
 
 PICTURES = structured()

@@ -16,7 +16,6 @@ from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages import charts as stage
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
-from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
 FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset
@@ -57,7 +56,6 @@ def block_reach(origin: np.ndarray, rays: np.ndarray, grow: float = 0.0) -> np.n
 class Room:
     """Views of surfaces that the block hides."""
 
-    views: list[ViewMasks]
     witnesses: list[Witness]
 
 
@@ -70,7 +68,7 @@ def room(
 ) -> Room:
     """Photos and depth maps, the latter with relative noise."""
     rng = np.random.default_rng(5)
-    views, witnesses = [], []
+    witnesses = []
     for camera in eyes:
         shape = (camera.height, camera.width)
         rays = camera.unproject(camera.pixel_centres(), np.ones(shape)) - camera.centre
@@ -84,10 +82,8 @@ def room(
         object_ = (front < surface).astype(np.uint8)
         hidden, some = (cv2.dilate(object_, np.ones((n, n), np.uint8)) > 0 for n in (3, 7))
         depth = (z * (1 + noise * rng.normal(size=shape))).astype(np.float32)
-        alpha, no = shown.astype(np.float32), np.zeros(shape, bool)
-        views.append(ViewMasks(camera, hidden, hidden, no, no, depth, alpha, depth, alpha))
-        witnesses.append(Witness(camera, photo, hidden, some & ~hidden, depth))
-    return Room(views, witnesses)
+        witnesses.append(Witness(camera, photo, hidden, some & ~hidden, ~shown, depth))
+    return Room(witnesses)
 
 
 def hidden_everywhere(eyes: tuple[Camera, ...], points: np.ndarray, grow: float) -> np.ndarray:
@@ -143,26 +139,25 @@ def floor_room() -> Room:
 
 @pytest.fixture(scope="module")
 def floor_chart(floor_room: Room) -> Chart:
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, floor_room.witnesses)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.witnesses)
     return chart
 
 
 def test_a_plane_is_found_where_photos_have_it_though_depths_are_noisy(noisy: Room) -> None:
-    (plane,) = find_planes(noisy.views, noisy.witnesses, REGION)
-    assert len(find_planes(noisy.views, noisy.witnesses, REGION, ChartSettings(relief=0.0))) == 1  # the first stays
+    (plane,) = find_planes(noisy.witnesses, REGION)
+    assert len(find_planes(noisy.witnesses, REGION, ChartSettings(relief=0.0))) == 1  # the first stays
     normal, offset = SLANT
     assert np.degrees(np.arccos(plane.normal @ normal)) < 0.3
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
     assert np.abs(plane.points(x, y) @ normal - offset).max() < 0.003
-    (chart,) = charts_of([plane], noisy.views, noisy.witnesses)
+    (chart,) = charts_of([plane], noisy.witnesses)
     assert chart.kind == "plane"
 
 
 def test_depths_that_are_all_wrong_alike_do_not_move_the_plane(floor_room: Room) -> None:
     """Rough splats lie behind the surface that they show."""
-    sunk = [replace(v, depth_before=v.depth_before * np.float32(1.02)) for v in floor_room.views]
     witnesses = [replace(w, depth=w.depth * np.float32(1.02)) for w in floor_room.witnesses]
-    planes = find_planes(sunk, witnesses, REGION)
+    planes = find_planes(witnesses, REGION)
     assert planes[0].normal @ UP > np.cos(np.radians(0.3))
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
     assert np.abs(planes[0].points(x, y)[..., 2]).max() < 0.003
@@ -175,9 +170,8 @@ def test_a_plane_is_found_from_a_start_that_is_tilted(azimuth: float) -> None:
     slope, towards = np.tan(np.radians(8)), np.radians(azimuth)
     aslant = np.array([slope * np.cos(towards), slope * np.sin(towards), 1])
     true, tilted = room(eyes, [FLOOR], colours=striped), room(eyes, [(aslant / np.linalg.norm(aslant), 0.0)])
-    views = [replace(v, depth_before=t.depth_before) for v, t in zip(true.views, tilted.views)]
     witnesses = [replace(w, depth=t.depth) for w, t in zip(true.witnesses, tilted.witnesses)]
-    (plane,) = find_planes(views, witnesses, REGION)
+    (plane,) = find_planes(witnesses, REGION)
     assert plane.normal @ UP > np.cos(np.radians(1))
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
     assert np.abs(plane.points(x, y)[..., 2]).max() < 0.01 * extent(REGION)
@@ -192,7 +186,7 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
 
     eyes = front_cameras((0.5, 0.8, 1.2))
     seen = room(eyes, [FLOOR, WALL], noise=0.005, colours=colours)
-    planes = find_planes(seen.views, seen.witnesses, REGION)
+    planes = find_planes(seen.witnesses, REGION)
     assert len(planes) == 2
     for normal, _ in (FLOOR, WALL):
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
@@ -202,7 +196,7 @@ def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(fl
     floor = Plane.make(np.zeros(3), UP, REGION)
     guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)
     textures = Textures.make(floor_room.witnesses)
-    around = find._surface_round(floor_room.views, floor_room.witnesses, REGION)
+    around = find._surface_round(floor_room.witnesses, REGION)
     claim = find._Claim(guess, around, [], extent(REGION))
     elsewhere = claim.agreement(textures)(np.zeros(3))
     agreement, plane = find._best_known(claim, guess, elsewhere, [guess, floor], textures)
@@ -260,7 +254,7 @@ def test_a_chart_shows_the_floor_and_nothing_in_its_hole(floor_room: Room, floor
 
 def test_a_surface_that_nothing_hides_has_no_chart(floor_room: Room) -> None:
     clear = [replace(w, hidden=np.zeros_like(w.hidden)) for w in floor_room.witnesses]
-    assert charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, clear) == ()
+    assert charts_of([Plane.make(np.zeros(3), UP, REGION)], clear) == ()
 
 
 def area(chart: Chart, mask: np.ndarray) -> float:
@@ -281,7 +275,7 @@ def wide(floor_room: Room) -> list[Witness]:
 
 @pytest.fixture(scope="module")
 def wide_chart(floor_room: Room, wide: list[Witness]) -> Chart:
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, wide)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], wide)
     return chart
 
 
@@ -311,7 +305,7 @@ def test_what_seems_to_be_floor_amid_the_hole_is_part_of_it(floor_room: Room, mo
         return taken[-1].copy(), np.zeros_like(inner), np.zeros_like(inner)
 
     monkeypatch.setattr(stage, "_told_by_colours", told)
-    amid, beside = (charts_of([floor], floor_room.views, floor_room.witnesses)[0] for _ in range(2))
+    amid, beside = (charts_of([floor], floor_room.witnesses)[0] for _ in range(2))
     assert taken[0].sum() > 100 and amid.hole[taken[0]].all() and not amid.below.any()
     assert taken[1].sum() > 100 and beside.below[taken[1]].all() and not beside.hole[taken[1]].any()
 
@@ -324,7 +318,7 @@ def test_what_photos_disagree_on_below_the_mask_stays_hole(
         replace(w, photo=np.where((w.hidden & ~narrow.hidden)[..., None], w.photo[::-1], w.photo))
         for w, narrow in zip(wide, floor_room.witnesses)
     ]
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, other)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], other)
     assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
 
 
@@ -335,7 +329,7 @@ def test_a_plain_colour_below_the_mask_stays_hole(
     grey = [np.where(w.hidden[..., None], np.uint8(120), w.photo) for w in wide]
     monkeypatch.setattr(stage, "shows_object", lambda picture, *_: np.zeros(picture.shape[:2], bool))
     plain = [replace(w, photo=photo) for w, photo in zip(wide, grey)]
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.views, plain)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], plain)
     assert chart.hole[wide_chart.below].all()
 
 
@@ -354,7 +348,7 @@ def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
     known = []
     for share in (stage.MISPLACED, 0):
         monkeypatch.setattr(stage, "MISPLACED", share)
-        (chart,) = charts_of([plane], loud.views, beside)
+        (chart,) = charts_of([plane], beside)
         stripes = (texels(chart)[:, 0] > 0.4).reshape(chart.hole.shape) & chart.there & ~chart.hole & (chart.photos > 1)
         known.append(chart.known[stripes].mean())
     assert known[0] > 0.9 and known[1] < 0.5
@@ -366,7 +360,7 @@ def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
     left = np.arange(240) < 120
     marks = [w.hidden & left & (k == 0) for k, w in enumerate(wide)]  # in one view
     plane = Plane.make(np.zeros(3), UP, REGION)
-    (chart,) = charts_of([plane], floor_room.views, wide, ChartSettings(), marks)
+    (chart,) = charts_of([plane], wide, ChartSettings(), marks)
     on = sees(EYES[0], marks[0], texels(chart), np.inf).reshape(chart.hole.shape)
     assert (wide_chart.below & on).sum() > 500 and chart.hole[wide_chart.below & on].all()
     apart = cv2.dilate(on.astype(np.uint8), np.ones((17, 17))) == 0
@@ -376,7 +370,7 @@ def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
 
 def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:
     plane = Plane.make(np.zeros(3), UP, REGION)
-    small = charts_of([plane], floor_room.views, floor_room.witnesses, ChartSettings(largest=50))[0]
+    small = charts_of([plane], floor_room.witnesses, ChartSettings(largest=50))[0]
     assert max(small.camera.width, small.camera.height) in (50, 51)
     assert area(small, small.hole) == pytest.approx(area(floor_chart, floor_chart.hole), rel=0.05)
 
@@ -394,8 +388,8 @@ def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: t
     eyes = front_cameras(heights)
     seen = room(eyes, [FLOOR, WALL])
     planes = [Plane.make(np.zeros(3), UP, REGION), Plane.make(np.array([0, 0.4, 0]), WALL[0], REGION)]
-    chart = charts_of(planes, seen.views, seen.witnesses)[which]
-    (alone,) = charts_of(planes[which : which + 1], seen.views, seen.witnesses)
+    chart = charts_of(planes, seen.witnesses)[which]
+    (alone,) = charts_of(planes[which : which + 1], seen.witnesses)
     points, there, hole = texels(chart), chart.there.ravel(), chart.hole.ravel()
     behind = (points[:, 1] - 0.4, -points[:, 2])[which]  # how far behind the other surface
     assert alone.there.ravel()[behind > 0.01].any()  # the other chart, not the photos, ends this one
@@ -408,7 +402,7 @@ def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: t
 
 def test_parallel_surfaces_do_not_end_each_other(floor_room: Room, floor_chart: Chart) -> None:
     planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, 0.005)]
-    first = charts_of(planes, floor_room.views, floor_room.witnesses)[0]
+    first = charts_of(planes, floor_room.witnesses)[0]
     np.testing.assert_array_equal(first.there, floor_chart.there)
 
 
@@ -528,7 +522,7 @@ def test_what_a_single_photo_shows_through_the_object_is_no_island_in_the_hole(p
         there = room((witness.camera,), [FLOOR], block=False).witnesses[0]
         depth, photo = np.where(at, there.depth, witness.depth), np.where(at[..., None], there.photo, witness.photo)
         witnesses.append(replace(witness, hidden=witness.hidden & ~at, depth=depth, photo=photo))
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], given.views, witnesses)
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], witnesses)
     uv, _ = chart.camera.project(gap)
     col, row = uv[0].astype(int)
     island = ~chart.hole[row - 2 : row + 3, col - 2 : col + 3]

@@ -10,32 +10,32 @@ import pytest
 from scenes import BLOCK, REGION, cameras, charts_of, discs, floor, scene
 
 from gimp3d.gaussians import Gaussians
-from gimp3d.geometry import dilated
+from gimp3d.geometry import SOLID, dilated
 from gimp3d.presets import PRESETS
 from gimp3d.raster import footprint, render_bytes, surface_depth
-from gimp3d.stages.charts import Chart, Plane, lay_planes
+from gimp3d.run import ViewState
+from gimp3d.stages import clearing
+from gimp3d.stages.charts import Chart, Hits, Plane, lay_planes
 from gimp3d.stages.clearing import (
     ClearingSettings,
-    Targets,
     chart_targets,
     clear_air,
     hiding_rests,
     object_pixels,
     sunk_rows,
-    vouching,
     with_surface,
 )
 from gimp3d.stages.exposure import Exposure
 from gimp3d.stages.masks import Masks, ViewMasks
 from gimp3d.stages.selection import Fate, Selection
 from gimp3d.stages.witness import Says, Witness, ask
-from gimp3d.steps.behind import find_surfaces
-from gimp3d.view_state import ViewState
+from gimp3d.steps.behind import Surfaces, chart_surfaces, find_surfaces
 
 UP = np.array([0.0, 0, 1])
 EYES = cameras(9, 160, 120)
 TOLERANCE = 0.02
 NONE = np.zeros((120, 160), bool)  # no marks
+Targets = list[tuple[ViewMasks, Hits]]
 RED = np.array([200, 20, 20], np.uint8)  # of the block; the floor is grey
 
 
@@ -64,10 +64,10 @@ def removal(extra: Gaussians | None = None) -> Removal:
         views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha))
     selection = Selection(fates)
     masks = object_pixels(whole, selection.removed, views, ClearingSettings())
-    witnesses = [
-        Witness(v.camera, np.where(shown[..., None], RED, np.full(3, 99, np.uint8)), shown, some, v.depth_before)
-        for v, (shown, some) in zip(views, masks)
-    ]
+    grey, witnesses = np.full(3, 99, np.uint8), []
+    for v, (shown, some) in zip(views, masks):
+        photo = np.where(shown[..., None], RED, grey)
+        witnesses.append(Witness(v.camera, photo, shown, some, v.alpha_before < SOLID, v.depth_before))
     return Removal(whole, selection, views, witnesses)
 
 
@@ -82,19 +82,22 @@ def plain() -> Removal:
 
 @pytest.fixture(scope="module")
 def charts(plain: Removal) -> tuple[Chart, ...]:
-    return charts_of([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses)
+    return charts_of([Plane.make(np.zeros(3), UP, REGION)], plain.witnesses)
 
 
 @pytest.fixture(scope="module")
 def targets(plain: Removal, charts: tuple[Chart, ...]) -> Targets:
     p = plain
-    return chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
+    return chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, [NONE] * len(EYES))
 
 
-def cleared(removal: Removal, witnesses: list[Witness] | None = None, charts: tuple[Chart, ...] = ()) -> np.ndarray:
+def cleared(
+    removal: Removal, witnesses: list[Witness] | None = None, charts: tuple[Chart, ...] = (), observed: float = 0.2
+) -> np.ndarray:
     """Rows that clear_air removes on top of the selection's."""
+    settings = ClearingSettings(observed=observed)
     told = removal.witnesses if witnesses is None else witnesses
-    after = clear_air(removal.scene, REGION, removal.selection, removal.views, told, charts)
+    after = clear_air(removal.scene, REGION, removal.selection, told, charts, settings)
     new = after.removed & ~removal.selection.removed
     assert (after.fates[new] == Fate.REMOVED_REVEALED).all()
     np.testing.assert_array_equal(after.fates[~new], removal.selection.fates[~new])
@@ -181,7 +184,7 @@ def test_what_stands_before_no_surface_is_sunk(plain: Removal) -> None:
     places = [[OFF, 0, -0.02], [OFF, 0.1, 0.01], [OFF, 0, -0.02], [OFF, 0, -0.02], [0, 0, -0.02]]
     fates = [Fate.REMOVED_INSIDE, Fate.REMOVED_INSIDE, Fate.REMOVED_MASKED, Fate.OUTSIDE, Fate.REMOVED_STRADDLING]
     whole, selection = with_taken(plain, places, fates)
-    laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.views, plain.witnesses, REGION)
+    laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.witnesses, REGION)
     assert set(sunk_rows(whole, selection, laid) - len(plain.scene)) & set(range(5)) == {0, 4}
     assert not len(sunk_rows(whole, selection, ()))
 
@@ -215,7 +218,7 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     ring = (np.abs(plain.scene.means[:, :2]).max(1) < OFF) & (plain.scene.means[:, 2] < 0.01)
     whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
     taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
-    masks = Masks(Selection(taken), tuple(plain.views), (), "need", 1.0, "")
+    masks = Masks(Selection(taken), tuple(plain.views), "need", 1.0, "")
     photos = [render_bytes(whole, v.camera) for v in plain.views]
     levelled = Exposure(np.ones(3))
     views = [ViewState.first(v, photo, levelled) for v, photo in zip(plain.views, photos)]
@@ -275,31 +278,30 @@ def test_far_haze_and_haze_that_draws_nothing_stay() -> None:
     assert not {len(given.scene) - 2, len(given.scene) - 1} & new and new
 
 
-def test_photos_that_show_a_share_of_the_blend_weight_are_counted() -> None:
-    given = removal(specks([[0, 0, 0.25], [0.5, 0.45, 0.3]]))
-    stays = ~given.selection.removed
-    kept = given.scene.take(stays)
-    rows = np.zeros(len(kept), bool)
-    rows[-2:] = True
-    for least in (0.2, 0.8):
-        photos, hidden = vouching(kept, rows, given.views, given.witnesses, least)
-        assert not photos[~rows].any() and not hidden[~rows].any()
-        for row in (-2, -1):
-            chosen = np.zeros(len(kept), bool)
-            chosen[row] = True
+def test_haze_is_what_no_photo_shows_by_a_share_of_its_blend_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = removal(specks([[0, 0, 0.25], [0.5, 0.45, 0.3], [0.3, 0, 0.1]]))
+    kept, gone = given.scene.take(~given.selection.removed), []
+    for row in (-3, -2, -1):
+        chosen = np.zeros(len(kept), bool)
+        chosen[row] = True
+        for least in (0.0, 0.2, 0.8, 0.999):
             count, behind = 0, 0.0
             for view, told in zip(given.views, given.witnesses):
                 weight = footprint(kept, view.camera, chosen)
                 covered = float(weight[told.hidden].sum())
                 seen = float(weight[~told.hidden & ~told.beside].sum())
                 count, behind = count + (seen > 0.5 and seen >= least * (seen + covered)), behind + covered
-            assert photos[row] == count and hidden[row] == pytest.approx(behind, rel=1e-3)
-        assert photos[-2] == 0 < photos[-1]
+            for weight_, enough in ((0.999 * behind, behind > 0), (1.001 * behind, False)):
+                monkeypatch.setattr(clearing, "HAZE_WEIGHT", weight_)
+                found = len(given.scene) + row in cleared(given, observed=least)
+                assert found == (count == 0 and enough)
+                gone.append(found)
+    assert any(gone) and not all(gone[::2])
 
 
 def test_targets_lie_where_the_object_was_and_meet_a_chart(plain: Removal, targets: Targets) -> None:
-    assert len(targets.views) == len(targets.hits) == len(EYES)
-    for view, hits, witness in zip(targets.views, targets.hits, plain.witnesses):
+    assert len(targets) == len(EYES)
+    for (view, hits), witness in zip(targets, plain.witnesses):
         touched = footprint(plain.scene, view.camera, plain.selection.removed) > 0.05
         assert view.target.any()
         assert not (view.target & ~(witness.hidden | touched)).any()
@@ -308,7 +310,7 @@ def test_targets_lie_where_the_object_was_and_meet_a_chart(plain: Removal, targe
 
 
 def test_targets_are_the_floor_s_hole_below_the_block(plain: Removal, targets: Targets) -> None:
-    for view, witness in zip(targets.views, plain.witnesses):
+    for (view, _), witness in zip(targets, plain.witnesses):
         camera = view.camera
         rays = camera.unproject(camera.pixel_centres(), np.ones(view.target.shape)) - camera.centre
         with np.errstate(divide="ignore"):
@@ -321,12 +323,12 @@ def test_targets_are_the_floor_s_hole_below_the_block(plain: Removal, targets: T
 
 
 def test_targets_hold_the_charts_holes(plain: Removal, charts: tuple[Chart, ...], targets: Targets) -> None:
-    for view, hits, witness in zip(targets.views, targets.hits, plain.witnesses):
+    for (view, hits), witness in zip(targets, plain.witnesses):
         met = hits.chart == 0
         hole = np.zeros(met.shape, bool)
         hole[met] = charts[0].hole[hits.rows[met], hits.cols[met]]
         before = (view.alpha_after >= 0.5) & (view.depth_after > 0)
-        before &= view.depth_after < (1 - TOLERANCE) * hits.depth
+        before &= view.depth_after < (1 - charts[0].tolerance) * hits.depth
         assert view.target[hole & witness.hidden & ~before].all()
         assert not (view.target & before).any()
 
@@ -340,7 +342,7 @@ def test_what_is_known_only_from_below_the_mask_is_filled_too(charts: tuple[Char
 
     def target(chart: Chart) -> np.ndarray:
         rest = given.scene, given.selection, given.views, given.witnesses
-        return np.array([v.target for v in chart_targets(*rest, (chart,), TOLERANCE, [NONE] * len(EYES)).views])
+        return np.array([v.target for v, _ in chart_targets(*rest, (chart,), [NONE] * len(EYES))])
 
     left = replace(chart, hole=chart.hole & ~right)
     np.testing.assert_array_equal(target(replace(left, below=right)), target(chart))
@@ -354,16 +356,16 @@ def test_what_stays_before_the_floor_is_not_filled(charts: tuple[Chart, ...], ta
     bar = np.zeros((120, 160), bool)
     bar[:, 70:75] = True
     views[3] = replace(views[3], occluder=bar)
-    found = chart_targets(given.scene, given.selection, views, given.witnesses, charts, TOLERANCE, [NONE] * len(EYES))
+    found = chart_targets(given.scene, given.selection, views, given.witnesses, charts, [NONE] * len(EYES))
     board = np.arange(len(given.scene)) == len(given.scene) - 1
     kept = given.scene.take(~given.selection.removed)
     lost = 0
-    for view, plain_view in zip(found.views, targets.views):
+    for (view, _), (plain_view, _) in zip(found, targets):
         solid = footprint(kept, view.camera, board[~given.selection.removed]) > 0.8
         assert solid.any() and not (view.target & solid).any()
         lost += int((plain_view.target & solid).sum())
     assert lost > 50
-    assert (targets.views[3].target & bar).any() and not (found.views[3].target & bar).any()
+    assert (targets[3][0].target & bar).any() and not (found[3][0].target & bar).any()
 
 
 def test_marked_pixels_are_filled_too(plain: Removal, charts: tuple[Chart, ...], targets: Targets) -> None:
@@ -371,14 +373,14 @@ def test_marked_pixels_are_filled_too(plain: Removal, charts: tuple[Chart, ...],
     mark[5:15, 8:30] = True
     marks = [mark if k == 2 else NONE for k in range(len(EYES))]
     p = plain
-    found = chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, TOLERANCE, marks)
-    for k, (view, without) in enumerate(zip(found.views, targets.views)):
+    found = chart_targets(p.scene, p.selection, p.views, p.witnesses, charts, marks)
+    for k, ((view, _), (without, _)) in enumerate(zip(found, targets)):
         np.testing.assert_array_equal(view.target, without.target | mark if k == 2 else without.target)
 
 
 def test_views_after_are_those_of_the_emptied_scene(plain: Removal, targets: Targets) -> None:
     kept = plain.scene.take(~plain.selection.removed)
-    for view in targets.views:
+    for view, _ in targets:
         depth, alpha = surface_depth(kept, view.camera)
         np.testing.assert_allclose(view.alpha_after, alpha, atol=1e-5)
         both = (depth > 0) & (view.depth_after > 0)
@@ -386,6 +388,9 @@ def test_views_after_are_those_of_the_emptied_scene(plain: Removal, targets: Tar
 
 
 def test_without_charts_there_are_no_targets(plain: Removal) -> None:
-    p = plain
-    found = chart_targets(p.scene, p.selection, p.views, p.witnesses, (), TOLERANCE, [NONE] * len(EYES))
-    assert not any(v.target.any() for v in found.views) and not any(h.depth.any() for h in found.hits)
+    views = [ViewState.first(v, w.photo, Exposure(np.ones(3))) for v, w in zip(plain.views, plain.witnesses)]
+    objects = [(w.hidden, w.beside) for w in plain.witnesses]
+    surfaces = Surfaces((), (), plain.selection, objects, (NONE,) * len(EYES), 1.0, "")
+    found = chart_surfaces(plain.scene, REGION, surfaces, views, PRESETS["balanced"])
+    assert not found.charts and not found.targets and found.confidence == 0
+    np.testing.assert_array_equal(found.selection.fates, plain.selection.fates)

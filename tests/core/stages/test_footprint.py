@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gimp3d.stages.footprint import shows_object
+from gimp3d.stages.charts import shows_object
 
 RNG = np.random.default_rng(5)
 WOOD, RED = np.array([170.0, 130, 90]), np.array([190.0, 40, 40])

@@ -14,9 +14,8 @@ from scenes import BLOCK, REGION, block, cameras, floor, scene
 from gimp3d.box import Box, Region
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.pipeline import PRESETS, render_bytes
-from gimp3d.stages.growth import Growth
 from gimp3d.stages.masks import Masks, MaskSettings, find_masks
-from gimp3d.stages.selection import Fate
+from gimp3d.stages.selection import Fate, Growth
 
 VIEWS = cameras(12, 200, 150)
 FLOOR = len(floor(with_hole=True))

@@ -13,13 +13,13 @@ from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.presets import PRESETS
 from gimp3d.raster import render_bytes
+from gimp3d.run import ViewState
 from gimp3d.stages.exposure import exposures_of
 from gimp3d.stages.lifting import Arriving, _lifted, light_in, recoloured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
 from gimp3d.steps.behind import find_light, find_surfaces
-from gimp3d.view_state import ViewState
 
 
 @cache
@@ -58,9 +58,10 @@ def test_what_is_drawn_below_the_ground_is_lifted_nowhere() -> None:
 def test_dim_pixels_right_beside_the_object_are_filled_and_not_lifted() -> None:
     """They hold some of the object's own colours, which would be lifted with the ground's."""
     camera = Camera("0", 40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
-    hidden, beside = np.zeros((2, 30, 40), bool)
+    hidden, beside, no = np.zeros((3, 30, 40), bool)
     hidden[10:20, 10:20], beside[10:20, 20:22] = True, True
-    witness = Witness(camera, np.full((30, 40, 3), 60, np.uint8), hidden, beside, np.ones((30, 40), np.float32))
+    photo = np.full((30, 40, 3), 60, np.uint8)
+    witness = Witness(camera, photo, hidden, beside, no, np.ones((30, 40), np.float32))
     window = slice(0, 30), slice(0, 40)
     near = cv2.dilate((hidden | beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for light, filled in ((0.9, near & False), (0.6, near & ~hidden), (0.2, ~hidden)):
@@ -83,7 +84,7 @@ def test_what_would_be_brighter_than_lit_ground_is_filled_and_not_lifted() -> No
     ground = np.ones((30, 40), bool)
     ground[:10] = False
     window = slice(0, 30), slice(0, 40)
-    witness = Witness(camera, photo, no, no, np.ones((30, 40), np.float32))
+    witness = Witness(camera, photo, no, no, no, np.ones((30, 40), np.float32))
     lifted, shaded, filled, _ = _lifted(witness, Arriving(window, light, ground, 192.0))
     assert shaded.sum() == 600 and abs(int(lifted[20, 8, 0]) - 190) < 8
     expected = no.copy()
@@ -116,7 +117,7 @@ def test_a_channel_that_a_gaussian_cannot_show_is_left_alone() -> None:
     )
     no = np.zeros((30, 40), bool)
     drawn = render_bytes(black, camera)
-    witness = Witness(camera, drawn, no, no, np.full(no.shape, 1.7, np.float32))
+    witness = Witness(camera, drawn, no, no, no, np.full(no.shape, 1.7, np.float32))
     lifted = np.clip(drawn.astype(int) + 40, 0, 255).astype(np.uint8)
     rows, sh = recoloured(black, no.ravel()[:count], [witness], [lifted], [~no], [~no], 0)
     assert len(rows) > count / 2 and (sh[:, 0, 0] == -3).all()

@@ -23,6 +23,7 @@ from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
+from gimp3d.stages import propagate as stage
 from gimp3d.stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -36,7 +37,7 @@ from gimp3d.stages.propagate import (
     paper,
     propagate,
 )
-from gimp3d.stages.propagate import blend as stage
+from gimp3d.stages.propagate.paper import MappingField
 
 HOLE = (40, 60, 40, 65)  # rows and columns of T_0
 SHIFT = 30  # columns from a hole pixel to its source
@@ -58,10 +59,11 @@ def reference() -> Reference:
     return Reference(camera, image, depth, target, ~target & (depth > 0))
 
 
-def shifted_sources(reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+def shifted_sources(reference: Reference) -> MappingField:
     """Every hole pixel maps to itself shifted by 30 columns."""
     rows, cols = np.indices(reference.target.shape, np.int32)
-    return np.where(reference.target, rows, -1), np.where(reference.target, cols + SHIFT, -1)
+    found = (np.where(reference.target, x, -1) for x in (rows, cols + SHIFT))
+    return MappingField(*found, 1.0, "")
 
 
 def view(
@@ -94,7 +96,7 @@ def paint(
 ) -> tuple[PaintedView, np.ndarray, np.ndarray]:
     """The painted part, and the whole picture and rules."""
     (painted,) = run(reference, [target], settings).views
-    return painted, painted.pasted(target.base), painted.rule_map(*target.target.shape)
+    return painted, painted.pasted(target.base), painted.rule_map()
 
 
 def error(image: np.ndarray, target: ViewToPaint, where: np.ndarray, look=lambda colours: colours) -> float:
@@ -127,7 +129,7 @@ def test_the_order_and_company_of_views_does_not_matter(reference: Reference) ->
     views = [view(reference, k) for k in (0, 2, 4)]
     forward, backward = run(reference, views), run(reference, views[::-1])
     for a, b in zip(forward.views, backward.views[::-1]):
-        assert a.camera_id == b.camera_id and (a.image == b.image).all() and (a.rules == b.rules).all()
+        assert a.camera.id == b.camera.id and (a.image == b.image).all() and (a.rules == b.rules).all()
     (alone,) = run(reference, views[1:2]).views
     assert (alone.image == forward.views[1].image).all()
 
@@ -155,9 +157,7 @@ def test_the_new_surface_is_asked_for_near_the_hole_only(reference: Reference, s
     whole_, part = (paint(reference, v, settings_)[0] for v in (target, replace(target, depth_new=unknown)))
     for name in ("image", "raw", "rules", "depth"):
         np.testing.assert_array_equal(getattr(whole_, name), getattr(part, name))
-    h, w = part.rules.shape
-    there = np.s_[part.top : part.top + h, part.left : part.left + w]
-    np.testing.assert_array_equal(part.depth, target.depth_new[there])
+    np.testing.assert_array_equal(part.depth, target.depth_new[part.part])
 
 
 def test_views_are_let_go_once_they_are_painted(reference: Reference) -> None:
@@ -245,8 +245,8 @@ def test_a_view_without_a_hole_is_left_alone(reference: Reference) -> None:
 def test_without_sources_the_warped_reference_is_used(reference: Reference) -> None:
     none = np.full(reference.target.shape, -1, np.int32)
     target = view(reference, 2)
-    (painted,) = propagate(reference, [lambda: target], SAMPLE, sources=(none, none)).views
-    image, rules = painted.pasted(target.base), painted.rule_map(*target.target.shape)
+    (painted,) = propagate(reference, [lambda: target], SAMPLE, sources=MappingField(none, none, 1.0, "")).views
+    image, rules = painted.pasted(target.base), painted.rule_map()
     assert (rules == Rule.REFERENCE).sum() > 0.8 * target.target.sum()
     assert error(image, target, rules == Rule.REFERENCE) < 12
 
@@ -338,7 +338,7 @@ def test_another_view_lends_its_pixels_at_this_views_exposure(reference: Referen
     other = view(reference, 3)
     settings_ = PropagateSettings(transfer="sample", retarget=0)
     painted = run(reference, [hidden, other], settings_).views[0]
-    lent = painted.rule_map(90, 120) == Rule.OTHER_VIEW
+    lent = painted.rule_map() == Rule.OTHER_VIEW
     assert lent.sum() > 20
     raw = painted.pasted(hidden.base, painted.raw)
     assert abs(raw[lent].mean() - 0.5 * whole(dim.camera)[0][lent].mean()) < 15
@@ -379,14 +379,15 @@ def test_holes_of_any_size_at_any_place_are_painted(
 
 def test_a_part_is_pasted_where_it_belongs() -> None:
     rules = np.array([[0, Rule.OWN_PIXELS], [Rule.UNREACHED, 0]], np.uint8)
+    camera = replace(cameras(1)[0], width=4, height=6)
     part = PaintedView(
-        "v", 3, 1, np.full((2, 2, 3), 9, np.uint8), np.full((2, 2, 3), 5, np.uint8), rules, np.ones((2, 2))
+        camera, 3, 1, np.full((2, 2, 3), 9, np.uint8), np.full((2, 2, 3), 5, np.uint8), rules, np.ones((2, 2))
     )
     picture = np.zeros((6, 4, 3), np.uint8)
     changed = np.argwhere(part.pasted(picture).any(-1)).tolist()
     assert changed == [[3, 2], [4, 1]] and not picture.any()
     assert part.pasted(picture, part.raw).max() == 5
-    assert part.rule_map(6, 4)[3:5, 1:3].tolist() == rules.tolist() and part.rule_map(6, 4).sum() == rules.sum()
+    assert part.rule_map()[3:5, 1:3].tolist() == rules.tolist() and part.rule_map().sum() == rules.sum()
 
 
 def seam(rows: int = 30, cols: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import pytest
 from scenes import cameras, floor, truth
 
 from gimp3d.compute.threads import set_thread_count
-from gimp3d.evaluate.metrics import ssim_map
+from gimp3d.evaluate import ssim_map
 from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import Gradients, render
@@ -53,7 +53,7 @@ def test_new_gaussians_come_nearer_to_every_view_and_the_rest_keeps_its_bytes(
     found = refine_gaussians(known, seeds, observations, QUICK)
     assert {name: getattr(known, name).tobytes() for name in FIELDS} == before
     assert {name: getattr(seeds, name).tobytes() for name in FIELDS} == seeds_before
-    assert 0 < found.steps <= QUICK.steps and found.after < 0.7 * found.before
+    assert 0 < found.steps <= QUICK.steps and found.confidence > 1 / 0.7 - 1
     assert found.gaussians.usable.all() and len(found.gaussians) == len(seeds)
     for name in FIELDS:
         assert getattr(found.gaussians, name).dtype == np.float32
@@ -88,7 +88,7 @@ def test_held_out_views_keep_the_start_where_every_step_harms(
     monkeypatch.setattr(refine, "RATES", {**refine.RATES, "means": 50.0})
     monkeypatch.setattr(refine, "COLOUR", 5.0)
     found = refine_gaussians(known, seeds, observations, replace(QUICK, steps=30, check=5))
-    assert found.steps == 0 and found.after == found.before
+    assert found.steps == 0 and found.confidence == 0
     for name in FIELDS:
         assert np.array_equal(getattr(found.gaussians, name), getattr(seeds, name))
 

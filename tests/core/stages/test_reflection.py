@@ -11,7 +11,7 @@ from lit_scenes import Lamp, LitScene, cube, glossy_scene, grain, make_scene, re
 from scenes import BLOCK, REGION
 
 from gimp3d.box import Box
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.pipeline import PRESETS, RemovalResult, View, remove_object, render_bytes
 from gimp3d.raster import render
 from gimp3d.stages.charts import Plane

@@ -198,7 +198,7 @@ def test_without_corrections_view_dependence_is_fitted_to_painted_pixels_alone()
         image = np.repeat(np.rint(255 * grey)[..., None], 3, -1).astype(np.uint8)
         rules = np.full(depth.shape, Rule.OWN_PIXELS if k % 3 else Rule.REFERENCE, np.uint8)
         image[rules == Rule.REFERENCE] = 255
-        painted.append(PaintedView(camera.id, 0, 0, image, image, rules, depth))
+        painted.append(PaintedView(camera, 0, 0, image, image, rules, depth))
     target = np.zeros(depths[1].shape, bool)
     target[30:60, 40:80] = depths[1][30:60, 40:80] > 0
     seeds = seed_gaussians(reference, painted[1].image, depths[1], target, False)
@@ -206,7 +206,7 @@ def test_without_corrections_view_dependence_is_fitted_to_painted_pixels_alone()
     to_reference = means - reference.centre
     to_reference /= np.linalg.norm(to_reference, axis=-1, keepdims=True)
     chosen = SeedSettings(corrections=0, harmonics=HarmonicsSettings(ridge=0.01))
-    coloured = settle_gaussians(_of_degree(3), seeds, reference, list(zip(everywhere, painted)), chosen)
+    coloured = settle_gaussians(_of_degree(3), seeds, reference, painted, chosen)
     assert coloured.sh.shape[1] == 16 and (coloured.sh[:, 9:] == 0).all()
     assert (coloured.sh[:, 1:4] != 0).any((1, 2)).mean() > 0.9
 
@@ -233,18 +233,14 @@ def _hole_and_truth(count: int = 9) -> tuple[list[ViewToPaint], list[PaintedView
         rules = np.where(target, Rule.OWN_PIXELS, Rule.UNTOUCHED).astype(np.uint8)
         depth = drawn.median_depth
         views.append(ViewToPaint(camera, image, image, target, target, depth, depth))
-        painted.append(PaintedView(camera.id, 0, 0, image, image, rules, depth))
+        painted.append(PaintedView(camera, 0, 0, image, image, rules, depth))
     return views, painted
-
-
-def _looks(views: list[ViewToPaint], painted: list[PaintedView]) -> list[tuple[Camera, PaintedView]]:
-    return [(v.camera, paint) for v, paint in zip(views, painted)]
 
 
 def _filled(views: list[ViewToPaint], painted: list[PaintedView], chosen: SeedSettings) -> Gaussians:
     known, view = floor(with_hole=True), views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False, chosen)
-    return settle_gaussians(known, seeds, view.camera, _looks(views, painted), chosen)
+    return settle_gaussians(known, seeds, view.camera, painted, chosen)
 
 
 def test_settled_colours_leave_no_seam_and_show_every_view_better_than_pixel_colours() -> None:
@@ -290,7 +286,7 @@ def test_what_each_view_misses_tells_view_dependence_and_what_all_miss_does_not(
 
     def settled(degree: int, wanted: list[PaintedView]) -> Gaussians:
         chosen = SeedSettings(sh_degree=degree)
-        return settle_gaussians(known, seeds, views[1].camera, _looks(views, wanted), chosen)
+        return settle_gaussians(known, seeds, views[1].camera, wanted, chosen)
 
     sloped = [_tinted(p, v.camera, 30, 0) for p, v in zip(painted, views)]
     constant, dependent = settled(0, sloped), settled(2, sloped)
@@ -343,10 +339,9 @@ def test_gaussians_that_show_nowhere_are_left_out_and_the_rest_stays() -> None:
     view = views[1]
     seeds = seed_gaussians(view.camera, view.image, view.depth_new, view.target, False)
     below = replace(seeds, means=seeds.means - np.float32([0, 0, 0.1]))
-    looks = _looks(views, painted)
-    new = settle_gaussians(truth(), below, view.camera, looks, SeedSettings())
+    new = settle_gaussians(truth(), below, view.camera, painted, SeedSettings())
     assert len(new) < 0.1 * len(below)  # the floor hides them
-    everything = settle_gaussians(truth(), below, view.camera, looks, SeedSettings(corrections=0))
+    everything = settle_gaussians(truth(), below, view.camera, painted, SeedSettings(corrections=0))
     assert np.array_equal(everything.means, below.means)
 
 

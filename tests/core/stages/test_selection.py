@@ -59,7 +59,7 @@ def test_the_box_may_be_drawn_carelessly(scale: float, lower: float) -> None:
 def test_parts_of_the_object_outside_a_small_box_keep_nothing_in_it() -> None:
     small = (Box.make([0, 0, 0.3], [0.4, 0.4, 0.5]),)
     masks = found(scene(), small)
-    assert masks.selection.count(Fate.KEPT_SURFACE) == 0
+    assert masks.selection.counts["kept_surface"] == 0
     assert masks.removed[select_removed(scene(), small)].all()
 
 

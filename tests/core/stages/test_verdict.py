@@ -10,10 +10,11 @@ import pytest
 from scenes import BLOCK, REGION, block, cameras, charts_of, discs, floor, scene, truth
 
 from gimp3d.gaussians import Gaussians
+from gimp3d.geometry import SOLID
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import surface_depth
-from gimp3d.stages.charts import Chart, Plane
-from gimp3d.stages.clearing import ClearingSettings, Targets, chart_targets, object_pixels
+from gimp3d.stages.charts import Chart, Hits, Plane
+from gimp3d.stages.clearing import ClearingSettings, chart_targets, object_pixels
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Reference
 from gimp3d.stages.selection import Fate, Selection
@@ -31,7 +32,7 @@ class Case:
     keep: np.ndarray
     photos: dict[str, np.ndarray]
     charts: tuple[Chart, ...]
-    targets: Targets
+    targets: list[tuple[ViewMasks, Hits]]
 
     def judged(
         self,
@@ -41,9 +42,9 @@ class Case:
         with_charts: bool = True,
         photos: dict[str, np.ndarray] | None = None,
     ) -> Verdict:
-        views = self.targets.views
+        views = [v for v, _ in self.targets]
         left = [v.target & (added is None) for v in views]
-        hits = {v.camera.id: h for v, h in zip(views, self.targets.hits)} if with_charts else {}
+        hits = {v.camera.id: h for v, h in self.targets} if with_charts else {}
         seen = set(self.photos) if photographed else set()
         charts = self.charts if with_charts else ()
         kept = self.scene.take(self.keep)
@@ -67,13 +68,12 @@ def case(whole: Gaussians) -> Case:
     selection = Selection(np.where(removed, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
     pixels = object_pixels(whole, removed, views, ClearingSettings())
     witnesses = [
-        Witness(v.camera, photos[v.camera.id], shown, some, v.depth_before) for v, (shown, some) in zip(views, pixels)
+        Witness(v.camera, photos[v.camera.id], *objects, v.alpha_before < SOLID, v.depth_before)
+        for v, objects in zip(views, pixels)
     ]
-    charts = charts_of([Plane.make(np.zeros(3), np.array([0.0, 0, 1]), REGION)], views, witnesses)
+    charts = charts_of([Plane.make(np.zeros(3), np.array([0.0, 0, 1]), REGION)], witnesses)
     unmarked = [np.zeros((120, 160), bool)] * len(views)
-    return Case(
-        whole, ~removed, photos, charts, chart_targets(whole, selection, views, witnesses, charts, 0.02, unmarked)
-    )
+    return Case(whole, ~removed, photos, charts, chart_targets(whole, selection, views, witnesses, charts, unmarked))
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_without_charts_there_is_no_surface_for_haze(plain: Case, patch: Gaussia
 
 
 def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians, good: Verdict) -> None:
-    view = plain.targets.views[0]
+    view = plain.targets[0][0]
     filled = plain.scene.take(plain.keep).extended(patch)
     depth = surface_depth(filled, view.camera)[0]
     picture = Reference(view.camera, render_bytes(filled, view.camera), depth, view.target, ~view.target)
@@ -198,6 +198,6 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
 
 
 def test_nothing_to_judge(plain: Case, patch: Gaussians) -> None:
-    none = np.zeros((120, 160), bool)
-    views = [replace(v, silhouette=none, target=none) for v in plain.targets.views]
-    assert judge(plain.scene, plain.scene, views, [none] * len(views), plain.photos, set(plain.photos)) is None
+    none, photos = np.zeros((120, 160), bool), plain.photos
+    views = [replace(v, silhouette=none, target=none) for v, _ in plain.targets]
+    assert judge(plain.scene, plain.scene, views, [none] * len(views), photos, set(photos), (), {}, None) is None

@@ -10,7 +10,7 @@ import pytest
 from scenes import BLOCK, REGION, cameras, floor, scene
 
 from gimp3d.behind import Behind, look_behind
-from gimp3d.evaluate.metrics import psnr
+from gimp3d.evaluate import psnr
 from gimp3d.gaussians import ARRAYS, Gaussians
 from gimp3d.geometry import dilated
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
@@ -138,7 +138,7 @@ def test_what_is_drawn_before_the_new_gaussians_takes_their_colours() -> None:
         return float(np.mean([psnr(d, v.painted, v.rules == Rule.OWN_PIXELS) for v, d in drawn]))
 
     found = take_painted_colours(kept, added, seen)
-    after = found.scene(kept)
+    after = kept.with_rows(found.rows, found.gaussians)
     assert error(kept) < 30 and error(after) > error(kept) + 10
     assert (reach[found.rows] < 3 * BLOCK).all() and np.isin(np.flatnonzero(shadow), found.rows).mean() > 0.9
     assert (

@@ -18,10 +18,7 @@ from ...box import Region, in_region
 from ...compute.threads import parallel_map
 from ...geometry import dilated, framed, sees
 from ...solvers.kriging import carried
-from ..footprint import GRAIN, shows_object
-from ..masks import ViewMasks
-from ..mosaic import mosaic
-from ..witness import Says, Textures, Witness, ask
+from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
 from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_size
 from .find import find_planes as find_planes
@@ -36,6 +33,9 @@ MISPLACED = 0.4  # share of a texture that they have in common by which they may
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
 UNUSUAL = 99  # percentile of what surface texels differ by from those near them; mixed ones differ by more
+GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
+LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
+SAMPLES = 128  # colours of each kind, squared, that the models of both are made of
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
@@ -63,16 +63,11 @@ def chart_number(reference: str | None) -> int | None:
 
 
 def lay_planes(
-    planes: Sequence[Plane],
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],  # of the same views
-    region: Region,
-    settings: ChartSettings = ChartSettings(),
+    planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, settings: ChartSettings = ChartSettings()
 ) -> tuple[Laid, ...]:
     """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
-    textures = Textures.make(witnesses)
-    flats = [_placed(plane, region, views, witnesses, settings.largest) for plane in planes]
-    laid = [lay_surface(flat, region, views, witnesses, textures, settings) for flat in flats if flat is not None]
+    textures, flats = Textures.make(witnesses), (_placed(p, region, witnesses, settings.largest) for p in planes)
+    laid = (lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None)
     return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
 
 
@@ -138,9 +133,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
     )
 
 
-def _placed(
-    plane: Plane, region: Region, views: Sequence[ViewMasks], witnesses: Sequence[Witness], largest: float
-) -> Surface | None:
+def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float) -> Surface | None:
     """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
 
     None if the object hides nothing of it, or no view faces what it hides.
@@ -157,7 +150,7 @@ def _placed(
     size = high - low
     size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
     place = plane.points(*((low + high) / 2)[:, None])[0]
-    texel = pixel_size(place, plane.normal, views)
+    texel = pixel_size(place, plane.normal, witnesses)
     return flat_surface(plane, place, size, max(texel, float(size.max()) / largest)) if texel < math.inf else None
 
 
@@ -314,3 +307,36 @@ def shown_there(said: np.ndarray) -> np.ndarray:
     # single texels beside the object's foot err; edges of tables are long
     votes = cv2.GaussianBlur(np.sign(seen - through).astype(np.float32), (0, 0), VOTERS)
     return carried(votes[..., None].repeat(3, -1), known)[..., 0] >= 0
+
+
+def shows_object(
+    picture: np.ndarray,  # [H, W, 3] uint8
+    doubtful: np.ndarray,  # [H, W] bool, texels that may show either; all others show the surface
+    presumed: np.ndarray,  # [H, W] bool, those that show the object as far as is known without colours
+    object_colours: np.ndarray,  # [N, 3] uint8
+    surface_colours: np.ndarray,  # [M, 3] uint8
+) -> np.ndarray:
+    """[H, W] bool: doubtful texels that look like the object; the presumed ones where there is nothing to compare.
+
+    Two Gaussian mixtures and a minimum cut along edges of the picture (GrabCut: Rother 2004). The models stay as they
+    are learned from what is certain: in the doubtful texels either kind may be missing. The object's is of its colours
+    mixed with the surface's, as its edges are.
+    """
+    if not doubtful.any() or not len(object_colours) or not len(surface_colours):
+        return doubtful & presumed
+    rng = np.random.default_rng(0)
+    shown, surface = (
+        c[rng.integers(0, len(c), (SAMPLES, SAMPLES))].astype(float) for c in (object_colours, surface_colours)
+    )
+    share = rng.uniform(LEAST_SHARE, 1, (SAMPLES, SAMPLES, 1))
+    drawn = share * shown + (1 - share) * surface, surface
+    # a colour without any spread would be a model that nothing else fits, however near
+    certain = [np.clip(c + rng.normal(0, GRAIN, c.shape), 0, 255).astype(np.uint8) for c in drawn]
+    labels = np.repeat(np.array([cv2.GC_FGD, cv2.GC_BGD], np.uint8), SAMPLES)[:, None].repeat(SAMPLES, 1)
+    labels[[0, -1], [0, -1]] = cv2.GC_PR_FGD, cv2.GC_PR_BGD  # it refuses to work where nothing is in doubt
+    models = np.zeros((2, 1, 65))
+    cv2.setRNGSeed(0)
+    cv2.grabCut(np.concatenate(certain), labels, None, models[1], models[0], 1, cv2.GC_INIT_WITH_MASK)
+    labels = np.where(doubtful, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_BGD))
+    cv2.grabCut(np.ascontiguousarray(picture), labels, None, models[1], models[0], 1, cv2.GC_EVAL_FREEZE_MODEL)
+    return labels == cv2.GC_PR_FGD

@@ -16,10 +16,9 @@ import numpy as np
 from ...box import Region, in_region
 from ...camera import Camera
 from ...compute.threads import parallel_map
-from ...geometry import SOLID, WHOLE, framed, surface_points, window_round
+from ...geometry import WHOLE, framed, surface_points, window_round
 from ...schema import AtLeastOne, Share
 from ...solvers.poisson import thin_plate
-from ..masks import ViewMasks
 from ..witness import AGREEING, Says, Textures, Witness, ask
 from .plane import Plane, Surface, extent, largest_plane
 
@@ -82,42 +81,34 @@ class Beside:
         return self.eyes + np.where(reach > 0, reach, np.nan)[:, None] * rays
 
 
-def surface_depth_beside(view: ViewMasks, witness: Witness) -> np.ndarray:
-    """[H, W] z of the solid surfaces that a view shows beside the object; 0 elsewhere."""
-    return np.where(witness.hidden | (view.alpha_before < SOLID) | view.occluder, 0, view.depth_before)
-
-
-def surface_beside(
-    views: Sequence[ViewMasks], witnesses: Sequence[Witness], most: int, within: tuple[float, float] = (0.0, math.inf)
-) -> Beside:
+def surface_beside(witnesses: Sequence[Witness], most: int, within: tuple[float, float] = (0.0, math.inf)) -> Beside:
     """About as many points as are asked for, all of the same weight, within so many px from the object."""
 
-    def of(view: ViewMasks, witness: Witness) -> tuple[np.ndarray, np.ndarray]:
+    def of(witness: Witness) -> tuple[np.ndarray, np.ndarray]:
         far = cv2.distanceTransform((~witness.hidden).astype(np.uint8), cv2.DIST_L2, 5)
-        depth = np.where((far > within[0]) & (far <= within[1]), surface_depth_beside(view, witness), 0)
-        step = max(1, round(math.sqrt((depth > 0).sum() * len(views) / most)))
-        points = surface_points(view.camera, depth, step=step)[2]
-        return points, np.broadcast_to(view.camera.centre, points.shape)
+        depth = np.where((far > within[0]) & (far <= within[1]), witness.depth_beside, 0)
+        step = max(1, round(math.sqrt((depth > 0).sum() * len(witnesses) / most)))
+        points = surface_points(witness.camera, depth, step=step)[2]
+        return points, np.broadcast_to(witness.camera.centre, points.shape)
 
-    points, eyes = (np.concatenate(p) for p in zip(*parallel_map(lambda p: of(*p), zip(views, witnesses))))
+    points, eyes = (np.concatenate(p) for p in zip(*parallel_map(of, witnesses)))
     return Beside(points, eyes, np.ones(len(points)))
 
 
-def _surface_round(views: Sequence[ViewMasks], witnesses: Sequence[Witness], region: Region) -> Beside:
-    beside = surface_beside(views, witnesses, GATHERED, (MIXED_RIM, RING))
+def _surface_round(witnesses: Sequence[Witness], region: Region) -> Beside:
+    beside = surface_beside(witnesses, GATHERED, (MIXED_RIM, RING))
     beside = beside.take(~in_region(region, beside.points))
     said = ask(witnesses, beside.points, TOLERANCE)
     share = (said == Says.HIDDEN).sum(0) / np.maximum((said != Says.NOTHING).sum(0), 1)
     near = share > HIDDEN
     # few views, or all from one place: what is beside the object is all that tells
-    if len(views) < AGREEING or not near.any():
+    if len(witnesses) < AGREEING or not near.any():
         return beside
     return replace(beside, weight=share**2).take(near)
 
 
 def find_planes(
-    views: Sequence[ViewMasks],
-    witnesses: Sequence[Witness],  # of the same views
+    witnesses: Sequence[Witness],
     region: Region,
     settings: ChartSettings = ChartSettings(),
     settled: bool = True,  # by photos; else as splats draw them
@@ -130,8 +121,8 @@ def find_planes(
     painted on those. Of two planes that could both be what some pixels show photos choose as well.
     """
     diagonal, levels = extent(region), [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
-    textures, cameras = levels[-1], np.array([v.camera.centre for v in views])
-    left, rng = _surface_round(views, witnesses, region), np.random.default_rng(0)
+    textures, cameras = levels[-1], np.array([w.camera.centre for w in witnesses])
+    left, rng = _surface_round(witnesses, region), np.random.default_rng(0)
     least, sought = settings.least * left.weight.sum(), list[tuple[Plane, Beside]]()
     for _ in range(MOST):
         candidate = largest_plane(left.points, left.weight, INLIER * diagonal, cameras, region, rng)
@@ -144,10 +135,9 @@ def find_planes(
     if not settled:
         return tuple(all_planes)
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), diagonal) for plane, own in sought]
-    found = [(*_settled(claim, levels), claim) for claim in claims]
-    found = [
-        (*_best_known(claim, plane, best, [p for _, p, _ in found], textures), claim) for best, plane, claim in found
-    ]
+    settled_at = [_settled(claim, levels) for claim in claims]
+    known = [plane for _, plane in settled_at]
+    found = [(*_best_known(c, plane, best, known, textures), c) for c, (best, plane) in zip(claims, settled_at)]
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
     for _, plane, claim in found:
@@ -165,13 +155,12 @@ def grid(half: float, count: int) -> np.ndarray:
 
 def _bounds(plane: Plane, own: Beside, others: Sequence[Plane]) -> list[tuple[Plane, int]]:
     """The planes that a plane ends at, and on which side of them its own points lie: 1 above, −1 below."""
-    bounds = []
-    for other in others:
-        if plane.crosses(other):
-            above = float(own.weight @ (other.local(own.points)[:, 2] > 0) / own.weight.sum())
-            if max(above, 1 - above) > ONE_SIDED:
-                bounds.append((other, 1 if above > 0.5 else -1))
-    return bounds
+
+    def share(other: Plane, side: int) -> float:
+        return float(own.weight @ (side * other.local(own.points)[:, 2] > 0) / own.weight.sum())
+
+    crossed = [other for other in others if plane.crosses(other)]
+    return [(other, side) for other in crossed for side in (1, -1) if share(other, side) > ONE_SIDED]
 
 
 @dataclass(frozen=True)
@@ -279,7 +268,7 @@ def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float
     return Surface(plane, camera, np.full((height, width), away, np.float32))
 
 
-def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]) -> float:
+def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[Witness]) -> float:
     """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
     density = []
     for camera in (v.camera for v in views):
@@ -293,7 +282,6 @@ def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[ViewMasks]
 def lay_surface(
     flat: Surface,  # at the plane
     region: Region,
-    views: Sequence[ViewMasks],
     witnesses: Sequence[Witness],
     textures: Textures,
     settings: ChartSettings = ChartSettings(),
@@ -307,7 +295,7 @@ def lay_surface(
         return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
 
     level, diagonal = at(0.0, "plane"), extent(region)
-    offset, known = _drawn_surface(flat, views, witnesses, HEIGHT * diagonal, enough)
+    offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough)
     if known.sum() < TELLING:
         return level
     completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
@@ -323,7 +311,7 @@ def lay_surface(
 
 
 def _drawn_surface(
-    flat: Surface, views: Sequence[ViewMasks], witnesses: Sequence[Witness], height: float, enough: float
+    flat: Surface, witnesses: Sequence[Witness], height: float, enough: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """z of what views draw no higher than so much over a plane less the plane's, in cells of a few texels, and where
     that is known. Both [h, w]; the median over the views' points.
@@ -334,21 +322,20 @@ def _drawn_surface(
     corners = camera.unproject(ends, np.full(4, away, float))
     middle = corners.mean(0)
 
-    def of(view: ViewMasks, witness: Witness) -> np.ndarray:
+    def of(view: Witness) -> np.ndarray:
         uv, front = view.camera.project(corners)
         window = window_round(uv, view.camera, MARGIN) if (front > 0).all() else WHOLE
         z_there = float(view.camera.project(middle[None])[1][0])
         side = CELL * away / camera.fx * view.camera.fx / z_there if z_there > 0 else 1  # of a cell, in px
-        step = max(1, int(side * math.sqrt(len(views) / enough)))
-        points = surface_points(view.camera, surface_depth_beside(view, witness), window, step)[2]
+        step = max(1, int(side * math.sqrt(len(witnesses) / enough)))
+        points = surface_points(view.camera, view.depth_beside, window, step)[2]
         points = points[np.abs(flat.plane.local(points)[:, 2]) < height]
         _, rows, cols, z = framed(camera, points)
         return np.stack([rows // CELL * w + cols // CELL, z], -1)
 
-    found = np.concatenate(parallel_map(lambda p: of(*p), zip(views, witnesses)))
+    found = np.concatenate(parallel_map(of, witnesses))
     key, z = found[np.lexsort((found[:, 1], found[:, 0]))].T
     count = np.bincount(key.astype(int), minlength=h * w)
     known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
     value[known] = z[(np.cumsum(count) - count + count // 2)[known]]
-    value, known = value.reshape(h, w), known.reshape(h, w)
-    return np.where(known, value - away, 0), known
+    return np.where(known, value - away, 0).reshape(h, w), known.reshape(h, w)

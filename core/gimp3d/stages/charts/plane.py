@@ -146,15 +146,18 @@ class Hits:
         """[H, W] bool: the surface lies behind what the view draws (z or 0), by more than a relative tolerance."""
         return (depth > 0) & (depth < (1 - tolerance) * self.depth)
 
+    def of(self, maps: Sequence[np.ndarray]) -> np.ndarray:
+        """[H, W, ...] what maps of the surfaces, one each, hold where they are met; 0 elsewhere."""
+        found = np.zeros((*self.chart.shape, *maps[0].shape[2:]), maps[0].dtype)
+        for number, values in enumerate(maps):
+            on = self.chart == number
+            found[on] = values[self.rows[on], self.cols[on]]
+        return found
+
 
 def pictured(surfaces: Sequence[Facing], hits: Hits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the surfaces show where a view meets them, [H, W, 3] uint8, where that is known, and holes, [H, W] bool."""
-    image = np.zeros((*hits.chart.shape, 3), np.uint8)
-    known, hole = np.zeros((2, *hits.chart.shape), bool)
-    for number, surface in enumerate(surfaces):
-        on = hits.chart == number
-        at = hits.rows[on], hits.cols[on]
-        image[on], known[on], hole[on] = surface.image[at], surface.known[at], surface.hole[at]
+    image, known, hole = (hits.of([getattr(s, name) for s in surfaces]) for name in ("image", "known", "hole"))
     return image, known, hole
 
 

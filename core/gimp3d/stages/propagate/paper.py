@@ -1,67 +1,108 @@
-"""The paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
+"""The mapping field: which source patch of the reference explains each filled one (paper 3.3; docs/method.md).
+
+And the paper's Algorithm 1: a pixel takes the view's own colour at the source that the mapping field gives it.
 
 Where the view does not show that source, another one near it that looks alike is taken (retargeting), else another
-view's pixel (`transfer="sample"`); what is painted is blended to its rim (`blend="rim"`).
+view's pixel (`transfer="sample"`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 
 from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import parallel_map, run_ranges
-from ...geometry import SAME_DEPTH, colours_at
-from ...solvers.poisson import solve_poisson
+from ...geometry import SAME_DEPTH, colours_at, surface_points
+from ...schema import Signed
+from ...solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field
 from ...solvers.robust import exposure_gain
-from .blend import SEAM, SQUARE, to_bytes
+from ..witness import Says, Witness, ask, total_over
 from .warp import Loader, Picture, PropagateSettings, Reference, Rule, ViewToPaint, Warp, picture_of, shown_at
 
+MISFIT = 25.0  # grey levels of RMS misfit at which the field's confidence has fallen to 1/e
 RADIUS = 2  # px of the overlapping patches that are compared and blended (paper 4.1: 5 × 5)
 ALIKE = 25.0  # grey levels, RMS, up to which a patch found near a hidden source is alike
 OWN, REFERENCE, RETARGETED, OTHER = 2, 3, 5, 6  # members of Rule, for the kernels
 
-Sources = tuple[np.ndarray, np.ndarray]  # see propagate
-Sampler = Callable[[ViewToPaint, Warp, np.ndarray], None]  # see _sample
+
+@dataclass(frozen=True)
+class MappingSettings:
+    """How sources are judged."""
+
+    visibility: Signed = 0.002  # squared colour difference, λ_v of eq. 8, (11 grey levels)²; likeness, what views see
+    as_printed: bool = False  # compared at f(p), copied from p + f(p); nothing: the paper's cost misses p
+    patchmatch: PatchMatchSettings = field(default_factory=PatchMatchSettings)
 
 
 @dataclass(frozen=True)
-class Mapped:
-    """The reference and the list of its mapped pixels."""
+class MappingField:
+    """f as absolute source coordinates."""
 
-    reference: Reference
-    picture: Picture
-    rows: np.ndarray  # [M] int32, mapped pixels of T_0
-    cols: np.ndarray
-    source_rows: np.ndarray  # [M] int32, f
-    source_cols: np.ndarray
-    index: np.ndarray  # [H, W] int32, each pixel's place in the list; -1 = none
+    rows: np.ndarray  # [H, W] int32, -1 where there is none
+    cols: np.ndarray  # [H, W] int32
+    confidence: float
+    reason: str
 
-    @classmethod
-    def of(cls, reference: Reference, sources: Sources) -> Mapped:
-        there = reference.target & (sources[0] >= 0)
-        rows, cols = (x.astype(np.int32) for x in np.nonzero(there))
-        index = np.full(there.shape, -1, np.int32)
-        index[rows, cols] = np.arange(len(rows))
-        to_rows, to_cols = (np.ascontiguousarray(f[rows, cols], np.int32) for f in sources)
-        return cls(reference, picture_of(reference), rows, cols, to_rows, to_cols, index)
 
-    def shown_in(self, view: Picture, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not:
-        rows and columns [M] int32 in the reference; rules [M] uint8 OWN, RETARGETED, or 0 where the view shows none.
+def source_visibility(
+    camera: Camera,
+    depth: np.ndarray,  # [H, W] z-depth of the reference, 0 = nothing
+    views: Sequence[tuple[Camera, np.ndarray, np.ndarray]],  # (camera, z-depth with the object, hidden pixels)
+) -> np.ndarray:
+    """v(q) [H, W] float32: the share of views that show the source point at q: framed, in front, not hidden."""
+    rows, cols, points = surface_points(camera, np.where(np.isfinite(depth), depth, 0))
 
-        Patches are compared in the reference, where one camera sees both; the view only says which of them it shows.
-        """
-        found = self.source_rows.copy(), self.source_cols.copy(), np.zeros(len(self.rows), np.uint8)
-        given = self.rows, self.cols, self.picture, view, SAME_DEPTH, RADIUS, reach, 3 * ALIKE**2
-        run_ranges(_find_range, len(self.rows), *given, *found)
-        return found
+    def shown(view: tuple[Camera, np.ndarray, np.ndarray]) -> np.ndarray:
+        other, z, hidden = view
+        no = np.zeros_like(hidden)
+        witness = Witness(other, np.empty((0, 0, 3), np.uint8), hidden, no, no, z)
+        return ask([witness], points, SAME_DEPTH)[0] == Says.SEEN
+
+    share = np.zeros(depth.shape, np.float32)
+    share[rows, cols] = total_over(views, shown, rows.shape) / max(1, len(views))
+    return share
+
+
+def mapping_field(
+    image: np.ndarray,  # [H, W, 3] uint8, the inpainted reference
+    target: np.ndarray,  # [H, W] bool, T_0
+    source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
+    visibility: np.ndarray,  # [H, W] float32, see source_visibility
+    settings: MappingSettings = MappingSettings(),
+    seed: int = 0,
+) -> MappingField:
+    """The field f* that minimises misfit, incoherence and λ_v (1 − v) over T_0 (paper eq. 8, sign mended).
+
+    The target's colours are known (the reference is inpainted already), so no EM is needed.
+    """
+    penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
+    patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
+    nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
+    if settings.as_printed:  # the place that was compared is taken as the offset f(p); none where p + f(p) is no source
+        moved = np.stack([nearest.rows, nearest.cols]) + np.indices(source.shape)
+        kept = nearest.found & (moved[0] < source.shape[0]) & (moved[1] < source.shape[1])
+        kept[kept] = source[tuple(moved[:, kept])]
+        rows, cols = np.where(kept, moved, -1).astype(np.int32)
+        nearest = nearest._replace(rows=rows, cols=cols)
+    found = nearest.found
+    if not target.any():
+        confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
+    elif not found.any():
+        confidence = 0.0
+        reason = "no source patch: the reference shows nothing but the hole; its own colours are warped"
+    else:
+        rows, cols = nearest.rows[found], nearest.cols[found]
+        appearance = (nearest.cost[found] - penalty[rows, cols]) / (1 - patchmatch.coherence)
+        misfit = 255 * float(np.sqrt(max(0.0, appearance.mean())))
+        confidence = float(np.exp(-misfit / MISFIT))
+        reason = f"fill explained to {misfit:.1f} grey levels; "
+        reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
+    return MappingField(nearest.rows, nearest.cols, confidence, reason)
 
 
 @dataclass(frozen=True)
@@ -74,73 +115,67 @@ class Lent:
     gain: np.ndarray  # [3] its exposure over the reference's
 
 
-def sampler(reference: Reference, sources: Sources, views: Sequence[Loader], settings: PropagateSettings) -> Sampler:
+class Sampler:
     """Algorithm 1's sampling of any view; a few of the views lend it pixels at mapped sources that it does not show."""
-    mapped, count = Mapped.of(reference, sources), min(settings.donors, len(views))
-    chosen = [views[k * len(views) // count] for k in range(count)]
-    lent = parallel_map(lambda load: _lend(mapped, load()), chosen)
-    return partial(_sample, mapped, lent, settings.retarget)
 
+    def __init__(
+        self, reference: Reference, field: MappingField, views: Sequence[Loader], settings: PropagateSettings
+    ) -> None:
+        there = reference.target & (field.rows >= 0)
+        self.reference, self.picture, self.reach = reference, picture_of(reference), settings.retarget
+        self.pixels = [x.astype(np.int32) for x in np.nonzero(there)]  # rows and columns [M] of mapped pixels of T_0
+        self.sources = [np.ascontiguousarray(f[there], np.int32) for f in (field.rows, field.cols)]  # theirs, f
+        self.index = np.full(there.shape, -1, np.int32)  # each pixel's place in these lists; -1 = none
+        self.index[there] = np.arange(there.sum())
+        count = min(settings.donors, len(views))
+        chosen = [views[k * len(views) // count] for k in range(count)]
+        self.lent = parallel_map(lambda load: self._lend(load()), chosen)
 
-def _sample(
-    mapped: Mapped, lent: Sequence[Lent], retarget: int, view: ViewToPaint, warp: Warp, rules: np.ndarray
-) -> None:
-    """Change the warp's colours to sampled ones, and `rules` [h, w] uint8 from REFERENCE, as which they come in where
-    the warp reaches the hole. `retarget` is in px.
-    """
-    *sources, source_rules = mapped.shown_in(picture_of(view), retarget)
-    reached = rules == Rule.REFERENCE
-    found = np.append(source_rules, 0)[warp.lookup(mapped.index, reached)]  # -1, which is not in the list, is the last
-    rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
-    rows, cols = np.nonzero(reached)
-    taken = mapped.index, *sources, source_rules, *_borrowed(mapped, view, source_rules == 0, lent)
-    given = rows, cols, warp.u, warp.v, *taken, mapped.picture, picture_of(view), SAME_DEPTH, RADIUS
-    run_ranges(_sample_range, len(rows), *given, warp.colours, rules)
+    def __call__(self, view: ViewToPaint, warp: Warp, rules: np.ndarray) -> None:
+        """Change the warp's colours to sampled ones, and `rules` [h, w] uint8 from REFERENCE, as which they come in
+        where the warp reaches the hole.
+        """
+        *sources, source_rules = self._shown_in(picture_of(view), self.reach)
+        reached = rules == Rule.REFERENCE
+        found = np.append(source_rules, 0)[warp.lookup(self.index, reached)]  # -1, which is not in it, is the last
+        rules[reached] = np.where(found > 0, found, Rule.REFERENCE)
+        rows, cols = np.nonzero(reached)
+        taken = self.index, *sources, source_rules, *self._borrowed(view, source_rules == 0)
+        given = rows, cols, warp.u, warp.v, *taken, self.picture, picture_of(view), RADIUS
+        run_ranges(_sample_range, len(rows), *given, warp.colours, rules)
 
+    def _shown_in(self, view: Picture, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The mapped sources as far as the view shows them, retargeted by search within `reach` px where it does not:
+        rows and columns [M] int32 in the reference; rules [M] uint8 OWN, RETARGETED, or 0 where the view shows none.
 
-def _borrowed(
-    mapped: Mapped, view: ViewToPaint, wanted: np.ndarray, lent: Sequence[Lent]
-) -> tuple[np.ndarray, np.ndarray]:
-    """[M, 3] colours of wanted sources in the nearest view that shows them, at this exposure; [M] bool: there."""
-    colours, has = np.zeros((len(wanted), 3), np.float32), np.zeros(len(wanted), bool)
-    others = [x for x in lent if x.camera.id != view.camera.id]
-    others.sort(key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id))
-    gain = _lend(mapped, view).gain if others else np.ones(3)
-    for other in others:
-        new = other.seen & wanted & ~has
-        colours[new] = other.colours[new] * (gain / other.gain)
-        has |= new
-    return colours, has
+        Patches are compared in the reference, where one camera sees both; the view only says which of them it shows.
+        """
+        rows, cols = self.sources
+        found = rows.copy(), cols.copy(), np.zeros(len(rows), np.uint8)
+        given = *self.pixels, self.picture, view, RADIUS, reach, 3 * ALIKE**2
+        run_ranges(_find_range, len(rows), *given, *found)
+        return found
 
+    def _borrowed(self, view: ViewToPaint, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[M, 3] colours of wanted sources in the nearest view that shows them, at this exposure; [M] bool: there."""
+        colours, has = np.zeros((len(wanted), 3), np.float32), np.zeros(len(wanted), bool)
+        others = [x for x in self.lent if x.camera.id != view.camera.id]
+        others.sort(key=lambda x: (float(np.linalg.norm(x.camera.centre - view.camera.centre)), x.camera.id))
+        gain = self._lend(view).gain if others else np.ones(3)
+        for other in others:
+            new = other.seen & wanted & ~has
+            colours[new] = other.colours[new] * (gain / other.gain)
+            has |= new
+        return colours, has
 
-def _lend(mapped: Mapped, view: ViewToPaint) -> Lent:
-    seen = mapped.shown_in(picture_of(view), reach=0)[2] > 0
-    reference, camera = mapped.reference, view.camera
-    rows, cols = mapped.source_rows[seen], mapped.source_cols[seen]
-    z = mapped.picture.depth[rows, cols].astype(np.float64)
-    points = reference.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
-    colours = np.zeros((len(seen), 3), np.float32)
-    colours[seen] = colours_at(view.image, camera.project(points)[0])
-    return Lent(camera, colours, seen, exposure_gain(reference.image[rows, cols], colours[seen]))
-
-
-def blend_rim(
-    base: np.ndarray, raw: np.ndarray, painted: np.ndarray, no_photo: np.ndarray, depth: np.ndarray
-) -> np.ndarray:
-    """The paper's blend, [H, W, 3] uint8: gradients of the fill `raw` [H, W, 3] float32 where it is `painted` [H, W]
-    bool, its rim as in the view `base` [H, W, 3] uint8, but for `no_photo` [H, W] bool: the rest of the hole, drawings
-    of the emptied scene. The rim counts only where no seam of `depth`, [H, W] z of the new scene, parts it from the
-    fill. Parts without a rim keep their own colours.
-    """
-    if not painted.any():
-        return base.copy()
-    rim = (cv2.dilate(painted.astype(np.uint8), SQUARE) > 0) & ~painted & ~no_photo & (depth > 0)
-    nearest_fill = cv2.dilate(np.where(painted & (depth > 0), depth, 0).astype(np.float32), SQUARE)
-    rim &= np.abs(nearest_fill - depth) < SEAM * depth
-    solution = solve_poisson(painted, rim, base, np.where(painted[..., None], raw, np.nan).astype(np.float32))
-    result, free = base.copy(), solution.unanchored[..., None]
-    result[painted] = to_bytes(np.where(free, raw, solution.values)[painted])
-    return result
+    def _lend(self, view: ViewToPaint) -> Lent:
+        seen = self._shown_in(picture_of(view), reach=0)[2] > 0
+        rows, cols = (x[seen] for x in self.sources)
+        z = self.picture.depth[rows, cols].astype(np.float64)
+        points = self.reference.camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
+        colours = np.zeros((len(seen), 3), np.float32)
+        colours[seen] = colours_at(view.image, view.camera.project(points)[0])
+        return Lent(view.camera, colours, seen, exposure_gain(self.reference.image[rows, cols], colours[seen]))
 
 
 @inline_kernel
@@ -175,9 +210,7 @@ def _patch_misfit(reference, i, j, a, b, radius, worst):
 
 
 @kernel
-def _find_range(
-    lo, hi, rows, cols, reference, view, tolerance, radius, reach, worst, source_rows, source_cols, rules
-):  # fmt: skip
+def _find_range(lo, hi, rows, cols, reference, view, radius, reach, worst, source_rows, source_cols, rules):
     """Mapped pixels lo … hi−1 of the lists rows and cols: which source the view shows, and by which rule.
 
     The sources [M] come in as the field has them and leave as they are used; `worst` is the misfit of patches of a
@@ -186,7 +219,7 @@ def _find_range(
     for k in range(lo, hi):
         i, j = rows[k], cols[k]
         a, b = source_rows[k], source_cols[k]
-        _, _, good = shown_at(b + 0.5, a + 0.5, reference, view, tolerance)
+        _, _, good = shown_at(b + 0.5, a + 0.5, reference, view)
         if good:
             rules[k] = OWN
             continue
@@ -195,7 +228,7 @@ def _find_range(
         while 1 <= step <= reach:  # eight directions, ever farther out, then ever finer round the best
             for direction in range(9):
                 p, q = a + step * (direction // 3 - 1), b + step * (direction % 3 - 1)
-                _, _, good = shown_at(q + 0.5, p + 0.5, reference, view, tolerance)
+                _, _, good = shown_at(q + 0.5, p + 0.5, reference, view)
                 if good:
                     misfit = _patch_misfit(reference, i, j, p, q, radius, worst)
                     if misfit < best:
@@ -213,8 +246,8 @@ def _find_range(
 
 @kernel
 def _sample_range(
-    lo, hi, rows, cols, u, v, index, source_rows, source_cols, source_rules, borrowed, has, reference, view, tolerance,
-    radius, raw, rules
+    lo, hi, rows, cols, u, v, index, source_rows, source_cols, source_rules, borrowed, has, reference, view, radius,
+    raw, rules
 ):  # fmt: skip
     """Pixels lo … hi−1 of the lists rows and cols, which lie at (u, v) of the reference: the mean over patches.
 
@@ -234,11 +267,11 @@ def _sample_range(
                 if a < 0 or b < 0 or a >= h0 or b >= w0 or index[a, b] < 0:
                     continue
                 m = index[a, b]
-                if source_rules[m] == 0 or abs(reference.depth[a, b] - z0) > 2 * tolerance * z0:
+                if source_rules[m] == 0 or abs(reference.depth[a, b] - z0) > 2 * SAME_DEPTH * z0:
                     continue
                 # the patch at (a, b) explains this pixel by its source at the same place within the patch
                 uq, vq = source_cols[m] - dx + (u0 - j0), source_rows[m] - dy + (v0 - i0)
-                ut, vt, good = shown_at(uq, vq, reference, view, tolerance)
+                ut, vt, good = shown_at(uq, vq, reference, view)
                 if not good:
                     continue
                 weight = math.exp(-0.5 * (dx * dx + dy * dy))

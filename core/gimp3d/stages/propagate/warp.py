@@ -16,7 +16,7 @@ import numpy as np
 from ...camera import Camera
 from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import run_ranges
-from ...geometry import SAME_DEPTH, pack_camera, project, unproject
+from ...geometry import SAME_DEPTH, Window, pack_camera, project, unproject
 
 
 class Rule(IntEnum):
@@ -75,7 +75,7 @@ Loader = Callable[[], ViewToPaint]  # brings a view into memory; it is let go ag
 class PaintedView:
     """The part of a view round its painted hole."""
 
-    camera_id: str
+    camera: Camera  # the view's
     top: int  # row and column of the view where the part begins
     left: int
     image: np.ndarray  # [h, w, 3] uint8, I_t*
@@ -83,18 +83,21 @@ class PaintedView:
     rules: np.ndarray  # [h, w] uint8, see Rule
     depth: np.ndarray  # [h, w] z of the scene with the new surface
 
+    @property
+    def part(self) -> Window:
+        h, w = self.rules.shape
+        return slice(self.top, self.top + h), slice(self.left, self.left + w)
+
     def pasted(self, picture: np.ndarray, part: np.ndarray | None = None) -> np.ndarray:
         """The picture [H, W, 3] uint8, this part's hole pasted in: from `part` [h, w, 3], by default `image`."""
         whole = picture.copy()
-        h, w = self.rules.shape
-        place = whole[self.top : self.top + h, self.left : self.left + w]
         there = self.rules != Rule.UNTOUCHED
-        place[there] = (self.image if part is None else part)[there]
+        whole[self.part][there] = (self.image if part is None else part)[there]
         return whole
 
-    def rule_map(self, height: int, width: int) -> np.ndarray:
-        """The rules in the whole view, [height, width] uint8."""
-        return self.pasted(np.zeros((height, width), np.uint8), self.rules)
+    def rule_map(self) -> np.ndarray:
+        """The rules in the whole view, [H, W] uint8."""
+        return self.pasted(np.zeros((self.camera.height, self.camera.width), np.uint8), self.rules)
 
 
 @dataclass(frozen=True)
@@ -144,8 +147,7 @@ def warp_reference(reference: Reference, camera: Camera, depth: np.ndarray, want
     """
     rows, cols = np.nonzero(wanted)
     colours, (u, v) = np.zeros((*wanted.shape, 3), np.float32), np.full((2, *wanted.shape), np.nan)
-    given = rows, cols, pack_camera(camera), depth, picture_of(reference), SAME_DEPTH
-    run_ranges(_warp_range, len(rows), *given, colours, u, v)
+    run_ranges(_warp_range, len(rows), rows, cols, pack_camera(camera), depth, picture_of(reference), colours, u, v)
     return Warp(colours, u, v)
 
 
@@ -156,7 +158,7 @@ def _inside(u, v, h, w):
 
 
 @inline_kernel
-def shown_at(u, v, reference, view, tolerance):
+def shown_at(u, v, reference, view):
     """Where the view shows the surface point at (u, v) of the reference, and whether it does, unhidden."""
     h0, w0 = reference.depth.shape
     h, w = view.depth.shape
@@ -169,12 +171,12 @@ def shown_at(u, v, reference, view, tolerance):
             ut, vt, zt = project(view.camera, x, y, zw)
             if _inside(ut, vt, h, w):
                 i, j = int(vt), int(ut)
-                good = view.usable[i, j] and abs(view.depth[i, j] - zt) <= tolerance * zt
+                good = view.usable[i, j] and abs(view.depth[i, j] - zt) <= SAME_DEPTH * zt
     return ut, vt, good
 
 
 @kernel
-def _warp_range(lo, hi, rows, cols, camera, depth, ref, tolerance, colours, u, v):
+def _warp_range(lo, hi, rows, cols, camera, depth, ref, colours, u, v):
     """Pixels lo … hi−1 of the lists rows and cols: bilinear samples of reference pixels that show the same surface.
 
     Written are the colours [h, w, 3] and where they lie in the reference, u and v [h, w].
@@ -190,7 +192,7 @@ def _warp_range(lo, hi, rows, cols, camera, depth, ref, tolerance, colours, u, v
         if not _inside(u0, v0, h0, w0):
             continue
         i0, j0 = int(v0), int(u0)
-        if abs(ref.depth[i0, j0] - z0) > tolerance * z0:
+        if abs(ref.depth[i0, j0] - z0) > SAME_DEPTH * z0:
             continue
         a, b = math.floor(v0 - 0.5), math.floor(u0 - 0.5)
         t, s = v0 - 0.5 - a, u0 - 0.5 - b
@@ -199,7 +201,7 @@ def _warp_range(lo, hi, rows, cols, camera, depth, ref, tolerance, colours, u, v
             p, q = a + tap // 2, b + tap % 2
             if p < 0 or q < 0 or p >= h0 or q >= w0:
                 continue
-            if abs(ref.depth[p, q] - z0) > 2 * tolerance * z0:
+            if abs(ref.depth[p, q] - z0) > 2 * SAME_DEPTH * z0:
                 continue
             weight = (t if tap // 2 else 1 - t) * (s if tap % 2 else 1 - s) + 1e-6
             total += weight

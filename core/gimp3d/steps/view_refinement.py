@@ -17,7 +17,8 @@ import numpy as np
 from ..errors import BadInput
 from ..priors.calls import Call, Painter
 from ..priors.pasting import paste_picture, resized, scaled, window_round_hole
-from .propagate import Rule
+from ..run import ViewState
+from ..stages.propagate import Rule
 
 KEPT = (Rule.UNTOUCHED, Rule.UNREACHED, Rule.EVIDENCE)  # pixels that nobody is asked about: known, or without a colour
 LEAST = 64  # pixels of a view that somebody is asked about
@@ -26,17 +27,6 @@ COARSE = 4.0  # px, σ of the blur under which answer and painting are compared:
 # Grey levels, mean under that blur. On four scenes with truth, filled without a given picture, the true view is at most
 # 15 from the painting (median 7), the photo with the object 20 and more (median 48).
 MOST_DRIFT = 17.0
-
-
-@dataclass(frozen=True)
-class ViewToRefine:
-    """A painted view and the completed reference that painted most of it."""
-
-    camera_id: str
-    image: np.ndarray  # [H, W, 3] uint8
-    rules: np.ndarray  # [H, W] uint8, see Rule
-    reference: np.ndarray  # [H', W', 3] uint8
-    reference_target: np.ndarray  # [H', W'] bool, what was completed of it
 
 
 @dataclass(frozen=True)
@@ -69,52 +59,63 @@ class ViewRefinement:
             "views": {v.camera_id: {"accepted": v.image is not None, "reason": v.reason} for v in self.views},
         }
 
+    def applied(self, views: Sequence[ViewState]) -> tuple[ViewState, ...]:
+        """The views with the answers that were accepted."""
+        found = {view.id: view for view in views}
+        for answer in self.views:
+            view = found[answer.camera_id]
+            if answer.image is not None and view.rules is not None:
+                rules = np.where((answer.image != view.painted).any(-1), np.uint8(Rule.REFINED), view.rules)
+                found[view.id] = replace(view, painted=answer.image, rules=rules)
+        return tuple(found.values())
 
-def refine_views(who: Painter, views: Sequence[ViewToRefine], seed: int, call: Call) -> ViewRefinement:
-    """Ask about one view after the other.
+
+def refine_views(who: Painter, views: Sequence[ViewState], seed: int, call: Call) -> ViewRefinement:
+    """Ask about one painted view after the other.
 
     Raises BadInput if the painter fails at the first view; later failures only refuse their view.
     """
-    asked = [view for view in views if int(_mask(view).sum()) >= LEAST]
+    asked = [(v, m) for v in views if v.rules is not None and (m := ~np.isin(v.rules, KEPT)).sum() >= LEAST]
     done: list[RefinedView] = []
-    for k, view in enumerate(asked):
+    for k, (view, mask) in enumerate(asked):
         part = replace(call, progress=lambda stage, _, __, words="", k=k: call.progress(stage, k, len(asked), words))
-        part.tell(f"{who.who} looks at {view.camera_id}")
+        part.tell(f"{who.who} looks at {view.id}")
         try:
-            done.append(refine_view(who, view, seed, part))
+            done.append(refine_view(who, view, mask, seed, part))
         except BadInput as error:
             if not done:
                 raise
-            done.append(RefinedView(view.camera_id, None, str(error)))
+            done.append(RefinedView(view.id, None, str(error)))
     accepted = sum(v.image is not None for v in done)
     words = f"{accepted} of {len(done)} views refined by {who.who}" if done else "no view has anything to refine"
     return ViewRefinement(tuple(done), accepted / max(1, len(done)), words)
 
 
-def refine_view(who: Painter, view: ViewToRefine, seed: int, call: Call) -> RefinedView:
-    """One view; BadInput if the painter fails, a refused view if its answer does not agree."""
-    part = window_round_hole(_mask(view))
-    painted, mask = view.image[part], _mask(view)[part]
-    left = view.reference[window_round_hole(view.reference_target)] if view.reference_target.any() else view.reference
+def refine_view(who: Painter, view: ViewState, mask: np.ndarray, seed: int, call: Call) -> RefinedView:
+    """One view where it is masked [H, W] bool; BadInput if the painter fails, refused if its answer does not agree."""
+    assert view.best is not None
+    part, (_, reference) = window_round_hole(mask), view.best
+    painted, mask = view.painted[part], mask[part]
+    left = reference.image[window_round_hole(reference.target)]
     stitched, stitched_mask, beside = side_by_side(left, painted, mask)
     answer = resized(who.paint(stitched, stitched_mask, seed, call), stitched_mask.shape, who.answer)
-    h, w = mask.shape
     try:
-        pasted = paste_picture(painted, mask, scaled(answer[:, beside:], w, h), f"the answer of {who.who}")
+        right = scaled(answer[:, beside:], *mask.shape[::-1])
+        pasted = paste_picture(painted, mask, right, f"the answer of {who.who}")
         if pasted.warnings:
             raise BadInput(pasted.warnings[0])
         inside = mask.astype(np.float32)[..., None]  # under a blur that looks at the mask alone
         weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), COARSE), 1e-6)[..., None]
         off = cv2.GaussianBlur((pasted.image.astype(np.float32) - painted) * inside, (0, 0), COARSE) / weight
         drift = float(np.abs(off)[mask].mean())
+        words = f"{drift:.0f} grey levels from what was propagated"
         if drift > MOST_DRIFT:
-            words = f"{drift:.0f} grey levels from what was propagated, under a blur"
-            raise BadInput(f"{who.who} painted something else: {words}")
+            raise BadInput(f"{who.who} painted something else: {words}, under a blur")
     except BadInput as error:
-        return RefinedView(view.camera_id, None, str(error))
-    whole = view.image.copy()
+        return RefinedView(view.id, None, str(error))
+    whole = view.painted.copy()
     whole[part] = pasted.image
-    return RefinedView(view.camera_id, whole, f"{drift:.0f} grey levels from what was propagated; {pasted.reason}")
+    return RefinedView(view.id, whole, f"{words}; {pasted.reason}")
 
 
 def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -127,7 +128,3 @@ def side_by_side(reference: np.ndarray, view: np.ndarray, mask: np.ndarray) -> t
     shrunk = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
     both = np.hstack([scaled(reference, beside, height), scaled(view, width, height)])
     return both, np.hstack([np.zeros((height, beside), bool), shrunk]), beside
-
-
-def _mask(view: ViewToRefine) -> np.ndarray:
-    return ~np.isin(view.rules, KEPT)

@@ -14,8 +14,7 @@ from scenes import cameras
 
 from gimp3d.camera import Camera
 from gimp3d.orbit import look_at
-from gimp3d.stages.mosaic import mosaic
-from gimp3d.stages.witness import Says, Witness, ask
+from gimp3d.stages.witness import Says, Witness, ask, mosaic
 
 UP = np.array([0.0, 0, 1])
 ABOVE = Camera("above", 100, 80, 400.0, 400.0, 50.0, 40.0, look_at(4 * UP, np.zeros(3), np.array([0.0, 1, 0])))
@@ -36,7 +35,7 @@ def photo(camera: Camera) -> Witness:
     shown = z > 0
     colours = np.where(shown[..., None], np.clip(np.rint(texture(camera.centre + z[..., None] * rays)), 0, 255), 0)
     no = np.zeros(shape, bool)
-    return Witness(camera, colours.astype(np.uint8), no, no, np.where(shown, z, 0).astype(np.float32))
+    return Witness(camera, colours.astype(np.uint8), no, no, no, np.where(shown, z, 0).astype(np.float32))
 
 
 def said_of(witnesses: list[Witness]) -> np.ndarray:
@@ -144,8 +143,8 @@ def test_detail_is_that_of_the_photo_with_most_pixels() -> None:
     sharp, x = np.full((160, 200, 3), 100, np.uint8), np.arange(200)
     sharp += np.where(x // 8 % 2, 8, 0).astype(np.uint8)[None, :, None]
     no, z = np.zeros((160, 200), bool), np.full((160, 200), 4, np.float32)
-    far = [Witness(ABOVE, np.full((80, 100, 3), 104, np.uint8), no[:80, :100], no[:80, :100], z[:80, :100])] * 3
-    witnesses = [*far[:2], Witness(near, sharp, no, no, z), far[2]]
+    far = [Witness(ABOVE, np.full((80, 100, 3), 104, np.uint8), *[no[:80, :100]] * 3, z[:80, :100])] * 3
+    witnesses = [*far[:2], Witness(near, sharp, no, no, no, z), far[2]]
     picture, _, _ = mosaic(POINTS, UP, witnesses, said_of(witnesses))
     truth = sharp.reshape(80, 2, 100, 2, 3)[:, 0, :, 0]
     assert np.abs(picture.astype(int) - truth)[:, 10:-10].max() <= 1

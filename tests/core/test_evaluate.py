@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gimp3d.errors import BadInput
-from gimp3d.evaluate.metrics import evaluate_folders, flip_map, psnr, score, ssim_map
+from gimp3d.evaluate import evaluate_folders, flip_map, psnr, score, ssim_map
 from gimp3d.io.images import write_png
 
 RNG = np.random.default_rng(0)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gimp3d.forecast import CHARTED, STEPS, Clock, forecast_removal
 from gimp3d.pipeline import PRESETS
+from gimp3d.progress import CHARTED, STEPS, Clock, forecast_removal
 
 SIZES = st.tuples(st.integers(0, 10**7), st.integers(1, 500), st.integers(1, 10**9))
 

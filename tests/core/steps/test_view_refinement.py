@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from pictures import disc, error, scenery
+from pictures import disc, error, painted_view, scenery
 
 from gimp3d.errors import BadInput
 from gimp3d.job import StageStore
 from gimp3d.priors.calls import Call, Painter
 from gimp3d.priors.pasting import window_round_hole
+from gimp3d.run import ViewState
 from gimp3d.stages.propagate import Rule
-from gimp3d.stages.view_refinement import ViewRefinement, ViewToRefine, refine_views, side_by_side
+from gimp3d.steps.view_refinement import ViewRefinement, refine_views, side_by_side
 
 TRUTH, HOLE = scenery(120, 160), disc()
 REFERENCE = scenery(90, 200, seed=1)
 
 
-def view(name: str = "a") -> ViewToRefine:
+def view(name: str = "a") -> ViewState:
     """The truth, with its hole painted without details; a corner of the hole is photo."""
     painted = np.where(HOLE[..., None], cv2.GaussianBlur(TRUTH, (0, 0), 3), TRUTH)
     rules = np.where(HOLE, Rule.REFERENCE, Rule.UNTOUCHED).astype(np.uint8)
     rules[:55][HOLE[:55]] = Rule.EVIDENCE
-    return ViewToRefine(name, painted, rules, REFERENCE, disc(90, 200, 15))
+    return painted_view(name, painted, rules, REFERENCE, disc(90, 200, 15))
 
 
 ASKED = HOLE.copy()
@@ -70,7 +72,7 @@ def test_an_answer_that_agrees_brings_details_inside_the_mask_alone() -> None:
     done = refine_views(painter(truth, seen), [view()], 3, Call("--refine-views"))
     (refined,) = done.views
     assert refined.image is not None and done.confidence == 1 and int(refined.reason.split()[0]) < 10
-    before = view().image
+    before = view().painted
     assert (refined.image[~ASKED] == before[~ASKED]).all()
     assert error(refined.image, TRUTH, ASKED) < 0.2 * error(before, TRUTH, ASKED)
     ((image, mask),) = seen
@@ -122,8 +124,7 @@ def test_progress_counts_the_views() -> None:
 
 
 def test_views_with_nothing_invented_are_not_asked_about() -> None:
-    photo = view()
-    photo = ViewToRefine("a", photo.image, np.where(HOLE, Rule.EVIDENCE, Rule.UNTOUCHED), REFERENCE, HOLE[:90, :])
+    photo = replace(view(), rules=np.where(HOLE, Rule.EVIDENCE, Rule.UNTOUCHED))
     done = refine_views(painter(truth), [photo], 0, Call())
     assert done.views == () and done.facts()["asked"] == 0
 
@@ -131,6 +132,14 @@ def test_views_with_nothing_invented_are_not_asked_about() -> None:
 def test_an_answer_of_another_shape_is_refused() -> None:
     with pytest.raises(BadInput, match="not the shape"):
         refine_views(Painter("p", lambda i, *_: i[:40], "its picture"), [view()], 0, Call())
+
+
+def test_accepted_answers_stand_for_what_was_painted() -> None:
+    views = view("a"), view("b")
+    first, second = refine_views(painter(truth), views[:1], 0, Call()).applied(views)
+    changed = (first.painted != views[0].painted).any(-1)
+    assert changed.any() and (first.rules == np.where(changed, Rule.REFINED, views[0].rules)).all()
+    assert second is views[1]
 
 
 def test_what_was_asked_is_kept_for_resume(tmp_path: Path) -> None:

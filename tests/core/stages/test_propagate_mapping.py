@@ -10,7 +10,7 @@ import pytest
 from gimp3d.camera import Camera
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.geometry import SAME_DEPTH
-from gimp3d.stages.mapping import MappingSettings, mapping_field, source_visibility
+from gimp3d.stages.propagate.paper import MappingSettings, mapping_field, source_visibility
 
 View = tuple[Camera, np.ndarray, np.ndarray]
 

@@ -1,1 +1,0 @@
-"""Scores against ground truth, and the report."""
