@@ -59,18 +59,17 @@ def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[
     The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool.
     """
     count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    picture = image.astype(np.float32)
     found: list[Edge] = []
     for part in range(1, count):
         if parts[part, cv2.CC_STAT_AREA] >= LEAST_HOLE:
-            found += _of_part(picture, labels == part, known)
+            found += _of_part(image, labels == part, known)
     return tuple(found)
 
 
-def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
+def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
     near = bounds(hole, FURTHEST * REACH)
     corner = np.array([near[1].start, near[0].start])
-    picture, hole, known = picture[near], hole[near], known[near]
+    picture, hole, known = image[near].astype(np.float32), hole[near], known[near]
     scale = min(1.0, SIDE / max(hole.shape))
     size = tuple(max(1, round(n * scale)) for n in hole.shape[::-1])
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -158,10 +158,8 @@ def _filled(
         field = upsampled(coarser, level.touching, allowed)
         colours = _voted(level, field, level.channels[hole])
 
-    def matched(
-        field: NearestNeighbourField, colours: np.ndarray, number: int
-    ) -> tuple[NearestNeighbourField, np.ndarray]:
-        nonlocal usual
+    def matched(colours: np.ndarray, number: int) -> np.ndarray:
+        nonlocal field, usual
         shown[hole] = colours
         patches = lay_out(shown[..., :3].copy(), radius)
         heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
@@ -169,10 +167,10 @@ def _filled(
         matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
         field = refined(field, patches, level.touching, allowed, matching, penalty, guided, index, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))
-        return field, _voted(level, field, colours)
+        return _voted(level, field, colours)
 
     for number in range(rounds):
-        field, voted = matched(field, colours, number)
+        voted = matched(colours, number)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
         if change < SETTLED:
@@ -182,7 +180,7 @@ def _filled(
         field = shift_map(shown[..., :3].copy(), hole, level.usable, field)
         there = field.found[hole]
         copied = np.where(there[:, None], level.channels[field.rows[hole], field.cols[hole]], colours)
-        field, colours = matched(field, copied, number)
+        colours = matched(copied, number)
     return colours, field
 
 
@@ -276,11 +274,9 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Half the resolution; hole pixels do not mix into their neighbours."""
     size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
     known = (~hole).astype(np.float32)
-    visible = channels * known[..., None]
-    parts = visible[..., :3], visible[..., 3:]  # OpenCV takes four channels at most
-    total = np.dstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
-    share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
-    return total / np.maximum(share, 1e-6)[..., None], share < 0.5
+    planes = *np.dsplit(channels * known[..., None], [3]), known  # OpenCV takes four channels at most
+    *total, share = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes)
+    return np.dstack(total) / np.maximum(share, 1e-6)[..., None], share < 0.5
 
 
 def _voted(

@@ -309,11 +309,10 @@ def thin_plate(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.
     pull = (TENSION * radius / stride) ** -2
     coarse, weights, (h, w) = np.full(cells.shape, np.nan), count, domain.shape
     for smoothing in (STIFF, SMOOTHING):
-        energy = _energy(cells, smoothing**4 / stride**2, pull)
-        system = (energy + scipy.sparse.diags(weights[cells])).tocsc()
+        system = _energy(cells, smoothing**4 / stride**2, pull) + scipy.sparse.diags(weights[cells])
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
-        factors = scipy.sparse.linalg.splu(system, permc_spec="MMD_AT_PLUS_A", options=options)
-        coarse[cells] = factors.solve(weights[cells] * mean[cells])
+        factors = scipy.sparse.linalg.splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
+        coarse[cells] = factors.solve((weights * mean)[cells])
         # Tukey's weights of the residuals; never 0, lest a part of the domain lose all.
         off = np.where(count > 0, np.abs(coarse - mean), 0.0)
         share = off / (OUTLIER * (1.4826 * float(np.median(off[count > 0]))) + 1e-300)

@@ -63,10 +63,8 @@ def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tupl
         coarse = parallel_map(lambda angle: _of_turn(small, there, open_, band, angle, mirrored), ANGLES)
         found = []
         for _, angle, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
-            turn = turn_of(angle, mirrored)
-            # centres of pixels lie at p + 1/2 in either resolution
-            full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
-            found.append((angle, mirrored, full))
+            corner = turn_of(angle, mirrored).sum(1) / 2  # centres of pixels lie at p + 1/2 in either resolution
+            found.append((angle, mirrored, ratio * (shift + 0.5 - corner) - 0.5 + corner))
         settled = parallel_map(lambda f: _settled(picture, known, hole, ring, f), found)
         return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
 
@@ -80,8 +78,6 @@ def continue_regularly(
     filled, left = image.copy(), hole.copy()
     for motion in motions:
         rows, cols = np.nonzero(left)
-        if not len(rows):
-            break
         y, x = _mapped(motion.turn, motion.shift, rows, cols)
         tells = _sample(known.astype(np.float32), y, x) > 0.999
         filled[rows[tells], cols[tells]] = _sample(image, y[tells], x[tells], cv2.INTER_CUBIC)

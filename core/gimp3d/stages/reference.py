@@ -17,7 +17,7 @@ import scipy.ndimage
 from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import IllPosed
-from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals
+from ..geometry import SOLID, bounds, dilated, directions, disparity_of, framed, surface_normals, surface_points
 from ..priors.monodepth import DepthPrior, relative_disparity
 from ..schema import Signed
 from ..solvers.poisson import solve_poisson, thin_plate
@@ -70,7 +70,7 @@ def complete_depth(
     """Fill a hole in a disparity map.
 
     With a prior, in the gradient domain (paper 3.3): Δd = s_f Δd_m on the hole with d fixed on its known rim and
-    natural boundaries elsewhere (printed with the opposite sign: docs/method.md). Without one, what is round it is
+    natural boundaries elsewhere (printed with the opposite sign: docs/method.md). Without, what is round the hole is
     continued. Pixels that are NaN, infinite or negative are not known, pixels that do not agree with a prior that does
     fit are no rim. A part of the hole that has no rim takes the prior, aligned to the ring, or the nearest depth.
 
@@ -178,8 +178,9 @@ def fit_prior(
 
     if scale_factor is not None:
         shift = float(np.median(d - scale_factor * m))
-        words, line = f"guided, s_f = {scale_factor:g} as set", (scale_factor, shift)
-        return PriorFit(scale_factor, shift, 0.5, words, shown, line)
+        return PriorFit(
+            scale_factor, shift, 0.5, f"guided, s_f = {scale_factor:g} as set", shown, (scale_factor, shift)
+        )
     middle, spread = m.mean(), m.std()
     if spread < 1e-6 * max(float(np.abs(m).max()), 1e-150):
         return unused((0.0, float(np.median(d))), "it is constant round the hole")
@@ -284,10 +285,8 @@ def _surface_in(view: ViewMasks, samples: int) -> tuple[np.ndarray, ...]:
         return NO_SURFACE
     depth = np.where(target, completed.depth, depth)
     normals = surface_normals(camera, depth)
-    rows, cols = np.nonzero(target & (depth > 0) & (np.abs(normals).sum(-1) > 0))
-    z = depth[rows, cols].astype(np.float64)
-    points = camera.unproject(np.stack([cols + 0.5, rows + 0.5], -1), z)
-    spacing = 2 * z / np.sqrt(camera.fx * camera.fy)
+    rows, cols, points = surface_points(camera, np.where(target & (np.abs(normals).sum(-1) > 0), depth, 0))
+    spacing = 2 * depth[rows, cols].astype(np.float64) / np.sqrt(camera.fx * camera.fy)
     return points, normals[rows, cols] @ camera.R, spacing[:, None]
 
 
