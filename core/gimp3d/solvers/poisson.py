@@ -33,12 +33,6 @@ UNKNOWNS = 4000  # at most; larger domains are solved on a coarser grid
 STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
 OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
 
-SMOOTHING = 1.5  # px, σ below which the values' own noise is smoothed away
-TENSION = 1.0  # length, in radii of the hole, beyond which the plate is a membrane
-UNKNOWNS = 4000  # at most; larger domains are solved on a coarser grid
-STIFF = 15.0  # px, smoothing of a first plate that tells outliers: a soft one bends to clusters of them
-OUTLIER = 4.7  # standard deviations off the stiff plate at which a value does not count (Tukey: 95 % efficient)
-
 
 @dataclass(frozen=True)
 class PoissonSolution:
