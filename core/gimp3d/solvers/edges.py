@@ -17,7 +17,7 @@ import numpy as np
 
 from ..compute.threads import parallel_map
 from ..geometry import bounds
-from .regularity import pattern_search
+from .regularity import pattern_search, turn_of
 
 SIDE = 192  # px: pictures are shrunk to this to look for edges
 ANGLE = 2.0  # degrees between directions that are tried
@@ -59,18 +59,17 @@ def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[
     The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool.
     """
     count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    picture = image.astype(np.float32)
     found: list[Edge] = []
     for part in range(1, count):
         if parts[part, cv2.CC_STAT_AREA] >= LEAST_HOLE:
-            found += _of_part(picture, labels == part, known)
+            found += _of_part(image, labels == part, known)
     return tuple(found)
 
 
-def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
+def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
     near = bounds(hole, FURTHEST * REACH)
     corner = np.array([near[1].start, near[0].start])
-    picture, hole, known = picture[near], hole[near], known[near]
+    picture, hole, known = image[near].astype(np.float32), hole[near], known[near]
     scale = min(1.0, SIDE / max(hole.shape))
     size = tuple(max(1, round(n * scale)) for n in hole.shape[::-1])
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -88,7 +87,7 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
         side += sides.start
         if told[k, side, row] <= 0:
             break
-        along, across = _axes(angles[k])
+        along, across = turn_of(-angles[k])
         offset = row - heart
         cut = (places @ along)[np.abs(places @ across - offset) <= 1]
         edge = None
@@ -101,7 +100,7 @@ def _of_part(picture: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[E
         for end, inwards in (ways, ways[:1], ways[1:])[side]:
             place = offset * across + end * along
             for other, angle in enumerate(angles):
-                axes = _axes(angle)
+                axes = turn_of(-angle)
                 beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
                 here = BEFORE if inwards @ axes[0] > 0 else AFTER
                 told[other, [[BOTH], [here if edge is not None or side != BOTH else BOTH]], beside] = 0
@@ -115,17 +114,14 @@ class _Half:
     """An edge that is told on one side of the hole only."""
 
     edge: Edge
+    inwards: int  # 1 or -1: it runs into the hole along itself or against that
     enters: float  # px along it, where it runs into the hole
     leaves: float  # and out of it, or ends beyond
     goes_on: bool  # what is known beyond the hole does not tell that it ends
 
-    @property
-    def inwards(self) -> float:
-        return 1.0 if self.leaves > self.enters else -1.0
-
     def until(self, t: float) -> Edge:
-        outer = self.edge.ends[0 if self.inwards > 0 else 1]
-        return replace(self.edge, ends=(min(outer, t), max(outer, t)))
+        first, last = self.edge.ends
+        return replace(self.edge, ends=(first, t) if self.inwards > 0 else (t, last))
 
 
 def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
@@ -154,16 +150,10 @@ def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
     return list(found.values())
 
 
-def _axes(angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """(x, y) along a line and across it."""
-    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-    return np.array([c, s]), np.array([-s, c])
-
-
 def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, scale: float) -> np.ndarray:
     """[3, rows] of the picture turned by the angle: times of its noise that colours change there, by side."""
     h, w = hole.shape
-    along, across = _axes(angle)
+    along, across = turn_of(-angle)
     side = math.ceil(math.hypot(h, w)) | 1
     middle = np.array([w - 1, h - 1]) / 2 - (side - 1) / 2 * (along + across)
     matrix = np.column_stack([along, across, middle])
@@ -216,10 +206,11 @@ def _settled(
     rows, cols = np.nonzero(hole)
     pixels = np.stack([cols, rows], 1).astype(np.float64)
     shows = known.astype(np.float32)
-    heart = place + ((pixels - place) @ _axes(angle)[0]).mean() * _axes(angle)[0]
+    outset = turn_of(-angle)[0]
+    heart = place + ((pixels - place) @ outset).mean() * outset
 
     def at(values: np.ndarray) -> tuple[float, Edge | _Half | None]:
-        along, across = _axes(angle + values[0])
+        along, across = turn_of(-angle - values[0])
         origin = heart + values[1] * across
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
         if not len(cut):
@@ -248,16 +239,12 @@ def _settled(
             return told, edge if steady else None
         inwards = 1 if side == BEFORE else -1
         enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
-        if _goes_on(beyond[:, :CLOSE], told_by):
-            return told, _Half(edge, enters, leaves + inwards * CLOSE, True)
+        seen = _goes_on(beyond[:, :CLOSE], told_by)
         dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-        return told, _Half(edge, enters, leaves, bool(dark))
+        return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
 
-    def score(values: np.ndarray) -> float:
-        return at(values)[0]
-
-    values, best = pattern_search(score, np.eye(2))
-    return at(values)[1] if best > 0 else None
+    best, found = pattern_search(at, np.eye(2))
+    return found if best > 0 else None
 
 
 def _mean(sums: np.ndarray) -> np.ndarray:

@@ -118,8 +118,7 @@ def _by_patches(
         return None
     field: NearestNeighbourField | None = None
     expected = expect(image / np.float32(255), hole, ~(hole | unknown))
-    for finer in reversed(range(len(levels))):
-        channels, open_ = levels[finer]
+    for finer, (channels, open_) in reversed([*enumerate(levels)]):
         barred = cv2.resize(unknown.astype(np.float32), open_.shape[::-1], interpolation=cv2.INTER_AREA) > 0
         smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture
         guide = GUIDE * guide_of(edges, open_.shape, 2**finer, max(radius, 1))
@@ -152,45 +151,37 @@ def _filled(
         rounds, usual = COARSE_ROUNDS, 0.0  # cost of patches that were found; not known at first
         rows, cols = fill_inwards(level.channels, hole, allowed, radius, level.edges[..., 0] / EDGE)
         colours = level.channels[rows[hole], cols[hole]]
-        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32), radius)
+        field = NearestNeighbourField(rows, cols, np.zeros(hole.shape, np.float32))
         index = index_patches(lay_out(shown[..., :3].copy(), radius), allowed, TREE_GRID)
     else:
         rounds, usual = 1, float(np.median(coarser.cost[coarser.found]))
         field = upsampled(coarser, level.touching, allowed)
         colours = _voted(level, field, level.channels[hole])
 
-    def matched(
-        field: NearestNeighbourField, colours: np.ndarray, number: int
-    ) -> tuple[NearestNeighbourField, np.ndarray]:
-        nonlocal usual
+    def matched(colours: np.ndarray, number: int) -> np.ndarray:
+        nonlocal field, usual
         shown[hole] = colours
         patches = lay_out(shown[..., :3].copy(), radius)
         heed = np.float32(math.sqrt(EXPECTED * usual / max(usual + doubt, 1e-9) / 3))
         guided = np.dstack([shown[..., 3:], level.edges, heed * level.expected.colours])
         matching = PatchMatchSettings(coherence=0.0, sweeps=SWEEPS, seed=seed + 31 * number)
-        field = refined(field, patches, level.touching, allowed, matching, penalty, index, guided, tree_sweeps=1)
+        field = refined(field, patches, level.touching, allowed, matching, penalty, guided, index, tree_sweeps=1)
         usual = float(np.median(field.cost[level.touching]))
-        return field, _voted(level, field, colours)
+        return _voted(level, field, colours)
 
     for number in range(rounds):
-        field, voted = matched(field, colours, number)
+        voted = matched(colours, number)
         change = 255 * float(np.abs(voted - colours)[:, :3].mean())
         colours = voted
         if change < SETTLED:
             break
     for number in range(rounds, rounds + mosaics):
-        field = _sources(level, field, colours)
+        shown[hole] = colours
+        field = shift_map(shown[..., :3].copy(), hole, level.usable, field)
         there = field.found[hole]
         copied = np.where(there[:, None], level.channels[field.rows[hole], field.cols[hole]], colours)
-        field, colours = matched(field, copied, number)
+        colours = matched(copied, number)
     return colours, field
-
-
-def _sources(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> NearestNeighbourField:
-    """Where each of the hole's pixels is copied from; no patch's centre, so nothing may be voted with it."""
-    picture = level.channels[..., :3].copy()
-    picture[level.hole] = colours[:, :3]
-    return shift_map(picture, level.hole, level.usable, field)
 
 
 def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -> np.ndarray:
@@ -200,11 +191,10 @@ def _blended(level: _Level, field: NearestNeighbourField, colours: np.ndarray) -
     what the two pixels are copied from has its say. Rim pixels that the patches do not agree with at all, such as
     remains of what was removed, do not spread.
     """
-    box = bounds(level.hole, 1)
-    hole, corner = level.hole[box], np.array([b.start for b in box])
-    picture = level.channels[box][..., :3].copy()
-    picture[hole] = colours[:, :3]
-    sources = _sources(level, field, colours)
+    picture, box = level.channels[..., :3].copy(), bounds(level.hole, 1)
+    picture[level.hole] = colours[:, :3]
+    sources = shift_map(picture, level.hole, level.usable, field)
+    hole, picture, corner = level.hole[box], picture[box], np.array([b.start for b in box])
     rim = dilated(hole, 1) & ~hole & level.usable[box]
     said = _voted(level, field, picture[rim], np.argwhere(rim) + corner)
     rim[rim] = np.abs(said - picture[rim]).max(1) < DISAGREEMENT
@@ -284,11 +274,9 @@ def _halved(channels: np.ndarray, hole: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Half the resolution; hole pixels do not mix into their neighbours."""
     size = ((hole.shape[1] + 1) // 2, (hole.shape[0] + 1) // 2)
     known = (~hole).astype(np.float32)
-    visible = channels * known[..., None]
-    parts = visible[..., :3], visible[..., 3:]  # OpenCV takes four channels at most
-    total = np.dstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
-    share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
-    return total / np.maximum(share, 1e-6)[..., None], share < 0.5
+    planes = *np.dsplit(channels * known[..., None], [3]), known  # OpenCV takes four channels at most
+    *total, share = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in planes)
+    return np.dstack(total) / np.maximum(share, 1e-6)[..., None], share < 0.5
 
 
 def _voted(
@@ -325,12 +313,11 @@ def _vote(lo, hi, channels, places, dy, dx, rows, cols, weights, radius, voted):
                 if weight > 0.0:
                     v, u = rows[a, b] + y - a, cols[a, b] + x - b
                     total += weight
-                    if differs:
-                        for c in range(count):
-                            sums[c] += weight * (channels[v + dy, u + dx, c] - channels[v, u, c])
-                    else:
-                        for c in range(count):
-                            sums[c] += weight * channels[v, u, c]
+                    for c in range(count):
+                        value = channels[v + dy, u + dx, c]
+                        if differs:
+                            value -= channels[v, u, c]
+                        sums[c] += weight * value
         if total > 0.0:
             for c in range(count):
                 voted[k, c] = sums[c] / total

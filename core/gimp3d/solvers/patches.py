@@ -1,9 +1,8 @@
 """Square patches of a picture: how they lie in memory, their main components, and a kd-tree over those.
 
 The tree's leaves are blocks of 16, so that a leaf is compared at once. It is our own, as scipy's cKDTree answers for
-one patch at a time, where sweeps also look into the leaves of their neighbours' sources (He & Sun 2012). With its
-guesses in place of the tree, fields as near to the exact ones took 1.8–2 times the CPU time on two photographs of 1080p
-(0.73 -> 1.3–1.4 s, one thread), 1.3–2.4 times on five charts (16–68 -> 23–164 ms).
+one patch at a time, where sweeps also look into the leaves of their neighbours' sources (He & Sun 2012): with its
+guesses, fields as near to the exact ones took 1.8–2 times the CPU time on photographs, 1.3–2.4 times on charts.
 """
 
 from __future__ import annotations
@@ -22,6 +21,8 @@ SAMPLES = 4096  # patches that the main components are found from
 BOUND = 0.9999  # by which coordinates are shortened: rounding must not lift their distance above the patches'
 NOWHERE = 1e18  # coordinate of the last block's empty places
 SPREAD_SAMPLES = 256  # patches by which a node finds the component that spreads most
+
+Components = tuple[np.ndarray, np.ndarray]  # float32 mean [values of a patch] and basis [values of a patch, 16]
 
 
 class Patches(NamedTuple):
@@ -49,15 +50,11 @@ def lay_out(channels: np.ndarray, radius: int) -> Patches:
     return Patches(values, bordered.shape[1] * count, count, radius, weights)
 
 
-class Components(NamedTuple):
-    """Coordinates of patches: squared distances between them never exceed the patches' mean squared difference."""
-
-    mean: np.ndarray  # [values of a patch] float32
-    basis: np.ndarray  # [values of a patch, 16] float32
-
-
 def main_components(patches: Patches, starts: np.ndarray) -> Components:
-    """Of a sample of the patches that begin at `starts` (PCA); patches of fewer than 16 values leave zeros."""
+    """Of a sample of the patches that begin at `starts` (PCA); patches of fewer than 16 values leave zeros.
+
+    Squared distances between coordinates never exceed the patches' mean squared difference.
+    """
     size = 2 * patches.radius + 1
     chosen = starts[:: -(-len(starts) // SAMPLES)]
     within = np.arange(size)[:, None] * patches.stride + np.arange(size * patches.channels)
@@ -66,14 +63,14 @@ def main_components(patches: Patches, starts: np.ndarray) -> Components:
     vectors = np.linalg.eigh((sample - mean).T @ (sample - mean))[1][:, ::-1][:, :LANES]
     basis = np.zeros((within.size, LANES), np.float32)
     basis[:, : vectors.shape[1]] = vectors * (BOUND / np.sqrt(within.size))
-    return Components(mean.astype(np.float32), basis)
+    return mean.astype(np.float32), basis
 
 
 def coordinates(patches: Patches, components: Components, starts: np.ndarray) -> np.ndarray:
     """[N, 16] float32 of the patches that begin at `starts` [N] int64."""
     out = np.empty((len(starts), LANES), np.float32)
     size = 2 * patches.radius + 1
-    parts = components.mean, components.basis.ravel(), starts, out.ravel()
+    parts = components[0], components[1].ravel(), starts, out.ravel()
     run_ranges(_project, len(starts), patches.values, patches.stride, size, size * patches.channels, *parts)
     return out
 
@@ -157,7 +154,7 @@ def leaf_of(wanted, at, split_component, split_value):
 
 @kernel
 def _split(lo, hi, ends, found, order, split_component, split_value):
-    """Part the patches of each node [ends[k], ends[k + 1]) in two halves along the component where they spread most."""
+    """Part the patches of each node [ends[k], ends[k + 1]) in two along the component where they spread most."""
     for k in range(lo, hi):
         if ends[k + 1] - ends[k] < 2:
             continue

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -43,14 +44,12 @@ class PatchMatchSettings:
     seed: Seed = 0  # number; added to the removal's: another one gives another field
 
 
-@dataclass(frozen=True)
-class NearestNeighbourField:
+class NearestNeighbourField(NamedTuple):
     """For every target pixel its source pixel."""
 
     rows: np.ndarray  # [H, W] int32 source row, -1 outside the target or where there is no source
     cols: np.ndarray  # [H, W] int32
     cost: np.ndarray  # [H, W] float32, (1 − λ_s)·appearance + penalty
-    radius: int  # px: half the patch that was compared, smaller than asked for where the image has no room
 
     @property
     def found(self) -> np.ndarray:
@@ -62,7 +61,7 @@ def nearest_neighbour_field(
     image: np.ndarray,  # [H, W, 3] uint8
     target: np.ndarray,  # [H, W] bool
     source: np.ndarray,  # [H, W] bool, centres of patches that may be copied
-    penalty: np.ndarray | None = None,  # [H, W] float32 ≥ 0, added to the cost of each source
+    penalty: np.ndarray,  # [H, W] float32 ≥ 0, added to the cost of each source
     settings: PatchMatchSettings = PatchMatchSettings(),
 ) -> NearestNeighbourField:
     """The source patch that each target patch resembles most.
@@ -78,8 +77,9 @@ def nearest_neighbour_field(
     patches = lay_out(image.astype(np.float32) / 255, radius)
     index = index_patches(patches, allowed, GRID) if allowed.any() and target.any() else None
     rows, cols = np.full((2, *target.shape), -1, np.int32)
-    nothing = NearestNeighbourField(rows, cols, np.zeros(target.shape, np.float32), radius)
-    return refined(nothing, patches, target, allowed, settings, penalty, index)
+    nothing = NearestNeighbourField(rows, cols, np.zeros(target.shape, np.float32))
+    unguided = np.empty((*target.shape, 0), np.float32)
+    return refined(nothing, patches, target, allowed, settings, penalty, unguided, index)
 
 
 def patch_centres(usable: np.ndarray, radius: int) -> np.ndarray:
@@ -100,7 +100,7 @@ def upsampled(field: NearestNeighbourField, target: np.ndarray, allowed: np.ndar
     kept = allowed[v, u]
     rows, cols = np.full((2, h, w), -1, np.int32)
     rows[y[kept], x[kept]], cols[y[kept], x[kept]] = v[kept], u[kept]
-    return NearestNeighbourField(rows, cols, np.zeros((h, w), np.float32), field.radius)
+    return NearestNeighbourField(rows, cols, np.zeros((h, w), np.float32))
 
 
 def refined(
@@ -109,22 +109,20 @@ def refined(
     target: np.ndarray,  # [H, W] bool
     allowed: np.ndarray,  # [H, W] bool, source patch centres
     settings: PatchMatchSettings,
-    penalty: np.ndarray | None = None,  # [H, W] float32
-    index: tuple[Components, Tree] | None = None,  # of allowed patches
-    guides: np.ndarray | None = None,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
+    penalty: np.ndarray,  # [H, W] float32
+    guides: np.ndarray,  # [H, W, G] float32, compared at the patches' centres: squared differences add up
+    index: tuple[Components, Tree] | None,  # of allowed patches
     tree_sweeps: int = TREE_SWEEPS,
 ) -> NearestNeighbourField:
     """Sweeps at one resolution."""
     h, w = target.shape
     (rows, cols), cost = np.full((2, h, w), -1, np.int32), np.zeros((h, w), np.float32)
     if not allowed.any() or not target.any():
-        return NearestNeighbourField(rows, cols, cost, patches.radius)
+        return NearestNeighbourField(rows, cols, cost)
     kept, start = field.found & target, np.stack([field.rows, field.cols])
     kept[kept] = allowed[field.rows[kept], field.cols[kept]]
     if (kept != target).any():
         start = np.where(kept, start, nearest_allowed(allowed))
-    extra = np.zeros((h, w), np.float32) if penalty is None else penalty.astype(np.float32)
-    guides = np.empty((h, w, 0), np.float32) if guides is None else guides
     weights = np.array([1 - settings.coherence, settings.coherence, TRUNCATION**2, TIE / w], np.float32)
     number, wanted = np.zeros((h, w), np.int32), np.nonzero(target)
     number[wanted] = np.arange(len(wanted[0]))
@@ -139,13 +137,13 @@ def refined(
     edges = np.unique(np.concatenate([[0], limits, [h]])).tolist()
     for sweep in range(settings.sweeps):
         arguments = (
-            target, allowed, *patches, extra, *weights, guides,
+            target, allowed, *patches, penalty, *weights, guides,
             *tree, index is not None and sweep < tree_sweeps, looks, number,
             *start, sweep == 0, sweep % 2 == 0, uint32((settings.seed * 1009 + sweep) & 0xFFFFFFFF),
             rows.copy(), cols.copy(), rows, cols, cost,
         )  # fmt: skip
         parallel_map(partial(_sweep_band, *arguments), pairwise(edges))
-    return NearestNeighbourField(rows, cols, cost, patches.radius)
+    return NearestNeighbourField(rows, cols, cost)
 
 
 def nearest_allowed(allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

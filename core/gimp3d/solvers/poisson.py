@@ -1,13 +1,11 @@
-"""Poisson's equation on the pixels of an irregular hole, by conjugate gradients and a multigrid cycle.
+"""What is continued into a hole: by Poisson's equation, with wanted gradients or as a membrane, or as a thin plate.
 
-A cell of a coarser grid stands for 2×2 finer ones, and links to its neighbours by the sum of the links that cross
-their border: so every grid is a graph of four neighbours, and one relaxation serves all. A correction that is constant
-in each cell climbs in steps, which costs twice the energy of a slope; halved links make up for that (Braess 1995).
-Times beside other solvers: `make bench-poisson`.
+A membrane is fixed at the rim and forgets how the surface came to it; a thin plate keeps its slope and bends.
 
-And thin plates, the smoothest continuation of scattered values, slopes and bends included. A membrane (Laplace's
-equation) is fixed at the rim and forgets how the surface came to it. A thin plate keeps the slope: on curved ground its
-error is a half to a quarter of a membrane's, measured on random scenes.
+Poisson's equation is solved by conjugate gradients and a multigrid cycle. A cell of a coarser grid stands for 2×2 finer
+ones, and links to its neighbours by the sum of the links that cross their border: so every grid is a graph of four
+neighbours, and one relaxation serves all. A correction that is constant in each cell climbs in steps, which costs twice
+the energy of a slope; halved links make up for that (Braess 1995). Times beside other solvers: `make bench-poisson`.
 """
 
 from __future__ import annotations
@@ -120,8 +118,14 @@ def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
     count, parts = cv2.connectedComponents(hole.astype(np.uint8), connectivity=4)
     strength = np.bincount(parts.ravel(), tie.ravel(), count)
     loose = hole & (strength == 0)[parts]
-    if loose.any():
-        return _settled(task, loose, parts, tolerance)
+    if loose.any():  # what is unanchored takes its guidance; its pixels without guidance hang on those with
+        taken = loose & guided.all(-1)
+        lost = loose & (np.bincount(parts.ravel(), taken.ravel()) == 0)[parts]
+        filled, anchored = np.where(taken[..., None], given, task.values), (task.known & ~loose) | taken
+        rest = task._replace(hole=hole & ~taken & ~lost, known=anchored, values=filled)
+        result, iterations, _ = _solve(rest, tolerance)
+        result[taken], result[lost] = given[taken], np.nan
+        return result, iterations, loose
     strength[0] = 1
 
     def mean(of_ties: np.ndarray) -> np.ndarray:
@@ -137,17 +141,6 @@ def _solve(task: _Task, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
         result[..., c] += np.where(hole, shift + found - mean(tie * found), 0)
         most = max(most, iterations)
     return result, most, loose
-
-
-def _settled(task: _Task, loose: np.ndarray, parts: np.ndarray, tolerance: float) -> tuple[np.ndarray, int, np.ndarray]:
-    """Unanchored parts take their guidance, the rest is solved; pixels without guidance hang on those with."""
-    taken = loose & np.isfinite(task.guidance).all(-1)
-    lost = loose & (np.bincount(parts.ravel(), taken.ravel()) == 0)[parts]
-    values = np.where(taken[..., None], task.guidance, task.values)
-    hole, known = task.hole & ~taken & ~lost, (task.known & ~loose) | taken
-    result, iterations, _ = _solve(task._replace(hole=hole, known=known, values=values), tolerance)
-    result[taken], result[lost] = task.guidance[taken], np.nan
-    return result, iterations, loose
 
 
 class _Grid(NamedTuple):
@@ -281,30 +274,28 @@ def _advance(step, direction, product, diagonal, found, left):
     return total
 
 
-def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The surface u [H, W] float64 that is smoothest and nearest to the values; NaN off its domain.
+def thin_plate(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The surface u [H, W] float64 that is smoothest and nearest to the values v; NaN off its domain.
 
-    `weight` [H, W] ≥ 0 is how much each value counts, 0 = unknown; `wanted` [H, W] bool where it is asked for.
-    Minimises Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²) over wanted pixels and those of weight > 0, s
-    the values' common slope (Wahba 1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a
-    sparse factorisation. Parts of the domain without a value are NaN.
+    Values are `known` and the surface `wanted` where these [H, W] bool are true; both are the domain. Minimises
+    Σ w (u − v)² + λ ∫ (u_xx² + 2 u_xy² + u_yy² + |∇u − s|²/ℓ²), s the values' common slope, w 0 for outliers (Wahba
+    1990: thin-plate smoothing; Franke 1985: tension), with natural boundaries, by a sparse factorisation. On curved
+    ground its error is a half to a quarter of a membrane's, measured on random scenes. Parts without a value are NaN.
     """
-    wanted, weight = np.asarray(wanted, bool), np.asarray(weight, np.float64)
-    domain = wanted | (weight > 0)
+    domain = wanted | known
     result = np.full(domain.shape, np.nan)
-    if not (weight > 0).any():
+    if not known.any():
         return result
     window = bounds(domain)
-    domain, weight = domain[window], weight[window]
+    domain, known = domain[window], known[window]
     # Less their common slope: tension pulls at bends only, and cells that are half empty stand for their middle.
-    rows, cols = np.nonzero(weight > 0)
-    root, points = np.sqrt(weight[rows, cols]), np.stack([rows, cols, np.ones(len(rows))], -1)
-    slope = np.linalg.lstsq(points * root[:, None], values[window][rows, cols] * root, rcond=None)[0]
+    points = np.concatenate([np.argwhere(known), np.ones((known.sum(), 1))], axis=1)
+    slope = np.linalg.lstsq(points, values[window][known], rcond=None)[0]
     y, x = np.indices(domain.shape)
     trend = slope[0] * y + slope[1] * x + slope[2]
     stride = int(np.ceil(np.sqrt(domain.sum() / UNKNOWNS)))
-    count = _cells(weight, stride)
-    mean = _cells(np.where(weight > 0, values[window] - trend, 0.0) * weight, stride) / np.where(count > 0, count, 1)
+    count = _cells(known.astype(np.float64), stride)
+    mean = _cells(np.where(known, values[window] - trend, 0.0), stride) / np.maximum(count, 1)
     cells = _cells(domain.astype(np.float64), stride) > 0
     parts, _ = scipy.ndimage.label(cells)
     cells &= np.isin(parts, parts[count > 0])
@@ -312,11 +303,10 @@ def thin_plate(values: np.ndarray, weight: np.ndarray, wanted: np.ndarray) -> np
     pull = (TENSION * radius / stride) ** -2
     coarse, weights, (h, w) = np.full(cells.shape, np.nan), count, domain.shape
     for smoothing in (STIFF, SMOOTHING):
-        energy = _energy(cells, smoothing**4 / stride**2, pull)
-        system = (energy + scipy.sparse.diags(weights[cells])).tocsc()
+        system = _energy(cells, smoothing**4 / stride**2, pull) + scipy.sparse.diags(weights[cells])
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
-        factors = scipy.sparse.linalg.splu(system, permc_spec="MMD_AT_PLUS_A", options=options)
-        coarse[cells] = factors.solve(weights[cells] * mean[cells])
+        factors = scipy.sparse.linalg.splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
+        coarse[cells] = factors.solve((weights * mean)[cells])
         # Tukey's weights of the residuals; never 0, lest a part of the domain lose all.
         off = np.where(count > 0, np.abs(coarse - mean), 0.0)
         share = off / (OUTLIER * (1.4826 * float(np.median(off[count > 0]))) + 1e-300)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,6 +28,8 @@ BAND = 0.75  # width of the surroundings, in thicknesses of the hole
 LEAST_BAND = 6  # px
 PLAIN = 3 * 255.0**-2  # variance of the surroundings, one grey level in each channel, below which nothing is regular
 RIM = 4  # px right beside the hole
+
+Places = tuple[np.ndarray, np.ndarray]  # rows and columns of pixels
 
 
 @dataclass(frozen=True)
@@ -60,11 +63,9 @@ def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tupl
         coarse = parallel_map(lambda angle: _of_turn(small, there, open_, band, angle, mirrored), ANGLES)
         found = []
         for _, angle, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
-            turn = _turn(angle, mirrored)
-            # centres of pixels lie at p + 1/2 in either resolution
-            full = ratio * (shift + 0.5 - turn @ np.full(2, 0.5)) - 0.5 + turn @ np.full(2, 0.5)
-            found.append((angle, mirrored, full))
-        settled = parallel_map(lambda f: _settled(picture, known, hole, ring, *f), found)
+            corner = turn_of(angle, mirrored).sum(1) / 2  # centres of pixels lie at p + 1/2 in either resolution
+            found.append((angle, mirrored, ratio * (shift + 0.5 - corner) - 0.5 + corner))
+        settled = parallel_map(lambda f: _settled(picture, known, hole, ring, f), found)
         return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
 
     return motions(mirrored=False) or motions(mirrored=True)
@@ -77,8 +78,6 @@ def continue_regularly(
     filled, left = image.copy(), hole.copy()
     for motion in motions:
         rows, cols = np.nonzero(left)
-        if not len(rows):
-            break
         y, x = _mapped(motion.turn, motion.shift, rows, cols)
         tells = _sample(known.astype(np.float32), y, x) > 0.999
         filled[rows[tells], cols[tells]] = _sample(image, y[tells], x[tells], cv2.INTER_CUBIC)
@@ -86,8 +85,9 @@ def continue_regularly(
     return filled, hole & ~left
 
 
-def _turn(angle: float, mirrored: bool) -> np.ndarray:
-    """[2, 2] a turn, or a reflection at an axis of half the angle."""
+def turn_of(angle: float, mirrored: bool = False) -> np.ndarray:
+    """[2, 2] a turn by degrees, or a reflection at an axis of half the angle; its columns, a turn back's rows, are the
+    turned axes."""
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     return np.array([[c, s], [s, -c]] if mirrored else [[c, -s], [s, c]])
 
@@ -99,7 +99,7 @@ def _band(hole: np.ndarray, known: np.ndarray) -> np.ndarray:
     return known & (far <= max(LEAST_BAND, 2 * BAND * thickness))
 
 
-def _variance(image: np.ndarray, where: np.ndarray | tuple[np.ndarray, np.ndarray]) -> float:
+def _variance(image: np.ndarray, where: np.ndarray | Places) -> float:
     return float(image[where].var(0).sum())
 
 
@@ -114,7 +114,7 @@ def _of_turn(
 
     h, w = hole.shape
     side = (h, w) if angle == 0 else (math.ceil(math.hypot(h, w)),) * 2
-    turn = _turn(angle, mirrored)
+    turn = turn_of(angle, mirrored)
     middle = np.array([h - 1, w - 1]) / 2 - turn @ (np.array(side) - 1) / 2  # turned pixel z shows turn @ z + middle
     matrix = np.array([[turn[1, 1], turn[1, 0], middle[1]], [turn[0, 1], turn[0, 0], middle[0]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -151,58 +151,55 @@ def _of_turn(
 
 
 def _settled(
-    image: np.ndarray,
-    known: np.ndarray,
-    hole: np.ndarray,
-    band: np.ndarray,
-    angle: float,
-    mirrored: bool,
-    shift: np.ndarray,
+    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, guess: tuple[float, bool, np.ndarray]
 ) -> Motion | None:
-    """The motion nearby that explains most, if that is enough; it turns about the hole."""
+    """The motion near a guess that explains most, if that is enough; it turns about the hole."""
+    angle, mirrored, shift = guess
     ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (known & dilated(hole, RIM), 4000)))
     shows = known.astype(np.float32)
     middle = np.argwhere(hole).mean(0)
-    target = _turn(angle, mirrored) @ middle + shift
+    target = turn_of(angle, mirrored) @ middle + shift
 
     def at(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        turn = _turn(angle + values[0], mirrored)
+        turn = turn_of(angle + values[0], mirrored)
         return turn, target + values[1:] - turn @ middle
 
-    def explained(values: np.ndarray, of: tuple[np.ndarray, np.ndarray] = ring, overlap: float = OVERLAP) -> float:
-        """Share of the variance of the pixels; so many of them must be mapped to something known."""
+    def explained(values: np.ndarray, of: Places = ring, overlap: float = OVERLAP) -> tuple[float, np.ndarray]:
+        """Share of the variance of the pixels, and the values; so many of them must be mapped to something known."""
         rows, cols = of
         y, x = _mapped(*at(values), rows, cols)
         both = _sample(shows, y, x) > 0.999
         if both.sum() < max(1, overlap * len(rows)):
-            return -np.inf
+            return -np.inf, values
         rest = ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1).mean()
-        return 1 - float(rest) / (2 * max(_variance(image, of), PLAIN))
+        return 1 - float(rest) / (2 * max(_variance(image, of), PLAIN)), values
 
-    values, best = pattern_search(explained, np.eye(3)[0 if angle or mirrored else 1 :])
+    best, values = pattern_search(explained, np.eye(3)[0 if angle or mirrored else 1 :])
     y, x = _mapped(*at(values), *inside)
     tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
     # where something ends at the hole, only its rim contradicts; where it is plain, something far off is explained
-    if not tells or min(best, explained(values, rim, 0)) < EXPLAINED:
+    if not tells or min(best, explained(values, rim, 0)[0]) < EXPLAINED:
         return None
     return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * _variance(image, ring) / 3))
 
 
-def pattern_search(score: Callable[[np.ndarray], float], axes: np.ndarray) -> tuple[np.ndarray, float]:
-    """Values [N] near 0 with the best score, and that; steps of 1 to 0.1 along axes [K, N] are tried (Hooke 1961)."""
+def pattern_search(at: Callable[[np.ndarray], tuple[float, Any]], axes: np.ndarray) -> tuple[float, Any]:
+    """The best score, and what comes with it, of values [N] near 0; steps of 1 to 0.1 along axes [K, N] are tried
+    (Hooke 1961)."""
     values, step = np.zeros(axes.shape[1]), 1.0
-    best = score(values)
+    best = at(values)
     while step > 0.1:
         moves = [values + step * sign * axis for axis in axes for sign in (1, -1)]
-        scores = [score(m) for m in moves]
-        if max(scores) > best:
-            values, best = moves[int(np.argmax(scores))], max(scores)
+        found = [at(m) for m in moves]
+        k = int(np.argmax([score for score, _ in found]))
+        if found[k][0] > best[0]:
+            values, best = moves[k], found[k]
         else:
             step /= 2
-    return values, best
+    return best
 
 
-def _thinned(where: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(where: np.ndarray, most: int) -> Places:
     rows, cols = np.nonzero(where)
     step = max(1, -(-len(rows) // most))
     return rows[::step], cols[::step]

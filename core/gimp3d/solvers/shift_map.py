@@ -7,8 +7,6 @@ iterated conditional modes (Besag 1986): a nearest-neighbour field is a good sta
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from numba import float32
@@ -46,7 +44,7 @@ def shift_map(
     shifts = np.where(found, np.stack([field.rows, field.cols]) - here, 0)
     _lower(np.argwhere(hole & found), picture, sources, votes, usable, hole & found, *shifts)
     rows, cols = np.where(found, here + shifts, -1).astype(np.int32)
-    return replace(field, rows=rows, cols=cols)
+    return field._replace(rows=rows, cols=cols)
 
 
 @exact_kernel

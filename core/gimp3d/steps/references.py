@@ -28,11 +28,10 @@ from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
 from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
-from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
-from ..stages.reference import rim
+from ..stages.reference import DepthCompletion, PriorFit, complete_depth, rim
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z
@@ -148,7 +147,7 @@ def complete_view_depth(
         there = view.hits.depth
         depth = np.where(masks.target & (there > 0), there, masks.depth_after).astype(np.float32)
         share = float((there[masks.target] > 0).mean())
-        return DepthCompletion(disparity_of(depth), depth, share, f"{share:.0%} of the hole lies on charts", PriorFit())
+        return DepthCompletion(depth, share, f"{share:.0%} of the hole lies on charts", PriorFit())
 
     def first_fill() -> np.ndarray:
         return paint_view(replace(view, hits=None), (), replace(settings, variant=0), picture, ask).image

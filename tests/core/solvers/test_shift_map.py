@@ -26,7 +26,7 @@ def field_of(shift: np.ndarray) -> NearestNeighbourField:
     rows, cols = (
         np.where(HOLE, at + shift[..., k], -1).astype(np.int32) for k, at in enumerate(np.indices(HOLE.shape))
     )
-    return NearestNeighbourField(rows, cols, np.zeros(HOLE.shape, np.float32), 3)
+    return NearestNeighbourField(rows, cols, np.zeros(HOLE.shape, np.float32))
 
 
 def test_a_few_pixels_that_are_copied_from_elsewhere_follow_their_neighbours(picture: np.ndarray) -> None:

@@ -298,7 +298,7 @@ def lay_surface(
     offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough)
     if known.sum() < TELLING:
         return level
-    completed = np.nan_to_num(thin_plate(offset, known.astype(float), np.ones(known.shape, bool))).astype(np.float32)
+    completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
     relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
     # splats are drawn a little behind the surface that they show: new ones must lie where they do
     near = offset[known & (np.abs(offset) < SINKS * diagonal)]

@@ -19,7 +19,7 @@ from ...compute.jit import inline_kernel, kernel
 from ...compute.threads import parallel_map, run_ranges
 from ...geometry import SAME_DEPTH, colours_at, surface_points
 from ...schema import Signed
-from ...solvers.patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_neighbour_field
+from ...solvers.patchmatch import PatchMatchSettings, nearest_neighbour_field
 from ...solvers.robust import exposure_gain
 from ..witness import Says, Witness, ask, total_over
 from .warp import Loader, Picture, PropagateSettings, Reference, Rule, ViewToPaint, Warp, picture_of, shown_at
@@ -83,8 +83,12 @@ def mapping_field(
     penalty = (settings.visibility * (1 - visibility)).astype(np.float32)
     patchmatch = replace(settings.patchmatch, seed=settings.patchmatch.seed + seed)
     nearest = nearest_neighbour_field(image, target, source, penalty, patchmatch)
-    if settings.as_printed:
-        nearest = _moved_by_places(nearest, source)
+    if settings.as_printed:  # the place that was compared is taken as the offset f(p); none where p + f(p) is no source
+        moved = np.stack([nearest.rows, nearest.cols]) + np.indices(source.shape)
+        kept = nearest.found & (moved[0] < source.shape[0]) & (moved[1] < source.shape[1])
+        kept[kept] = source[tuple(moved[:, kept])]
+        rows, cols = np.where(kept, moved, -1).astype(np.int32)
+        nearest = nearest._replace(rows=rows, cols=cols)
     found = nearest.found
     if not target.any():
         confidence, reason = 1.0, "nothing to map: the target region is empty in the reference"
@@ -99,17 +103,6 @@ def mapping_field(
         reason = f"fill explained to {misfit:.1f} grey levels; "
         reason += f"sources seen by {visibility[rows, cols].mean():.0%} of the views"
     return MappingField(nearest.rows, nearest.cols, confidence, reason)
-
-
-def _moved_by_places(nearest: NearestNeighbourField, source: np.ndarray) -> NearestNeighbourField:
-    """The place that was compared taken as the offset f(p); none where p + f(p) is no source."""
-    places = np.argwhere(nearest.found)
-    moved = places + np.stack([nearest.rows, nearest.cols], -1)[nearest.found]
-    kept = (moved < source.shape).all(1)
-    kept[kept] = source[tuple(moved[kept].T)]
-    rows, cols = np.full((2, *source.shape), -1, np.int32)
-    rows[tuple(places[kept].T)], cols[tuple(places[kept].T)] = moved[kept].T
-    return replace(nearest, rows=rows, cols=cols)
 
 
 @dataclass(frozen=True)
