@@ -279,14 +279,8 @@ def run_removal(
     pixels = sum(c.width * c.height for c in cameras)
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
     announce_compilation(lambda text: progress("compile", 0, 1, text))
-    warnings, scene = [], _precise(file)
-    if unusable := int((~file.gaussians.usable).sum()):
-        what = "Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"
-        warnings.append(f"{unusable} {what}")
+    scene = _precise(file)
     views = _load_views(cameras, job.images, scene)
-    rendered = sum(v.camera.split == "train" and not v.is_photo for v in views)
-    if rendered and job.images != "none":
-        warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
     picture = read_image(Path(job.reference_image)) if job.reference_image else None
     extra = _read_marks("--extra-masks", job.extra_masks, cameras)
     shadow = _read_marks("--shadow-masks", job.shadow_masks, cameras)
@@ -301,11 +295,24 @@ def run_removal(
             stages = folder / "stages" / (str(variant + 1) if variant else "")
             shared.own = StageStore(stages, key, resume, asdict(of_variant))
         results.append(remove_object(scene, views, region, of_variant, *given))
-    summary = summary_of(job, settings, file, results, warnings, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    summary = summary_of(job, settings, file, results, _input_warnings(job, file, views), seconds)
     if job.report:
         write_removal_report(Path(job.report), scene, views, results, summary)
     _write_results(job, folder, file, results, summary)
     return summary
+
+
+def _input_warnings(job: RemovalJob, file: SplatFile, views: Sequence[View]) -> list[str]:
+    """What is amiss with what was read."""
+    warnings = []
+    if unusable := int((~file.gaussians.usable).sum()):
+        what = "Gaussians hold NaN, infinity or a zero quaternion: ignored in use, kept in the file"
+        warnings.append(f"{unusable} {what}")
+    rendered = sum(v.camera.split == "train" and not v.is_photo for v in views)
+    if rendered and job.images != "none":
+        warnings.append(f"{rendered} of {len(views)} photos are missing: these views are rendered from the scene")
+    return warnings
 
 
 def _write_results(
