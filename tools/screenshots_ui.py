@@ -10,8 +10,9 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import bpy
 from mathutils import Matrix
@@ -23,6 +24,13 @@ PATIENCE = 240  # s for a removal
 
 def steps() -> Iterator[str]:
     """Yields the name of each picture to be taken, or "key-" and a key to press; "" only lets the window draw."""
+    view = yield from with_the_add_on()
+    yield from until_the_preview(view)
+    yield from through_a_removal(view)
+
+
+def with_the_add_on() -> Generator[str, None, dict[str, Any]]:
+    """Install it; returns what operators of the 3D view are run in."""
     bpy.ops.extensions.package_install_files(
         filepath=str(SHARE / "gimp3d.zip"), repo="user_default", enable_on_install=True, overwrite=True
     )
@@ -39,16 +47,18 @@ def steps() -> Iterator[str]:
     yield ""
     ui.active_panel_category = "3D-GIMP"
     yield "1-empty"
+    return {"window": bpy.context.window, "area": area, "region": region}
 
-    view = {"window": bpy.context.window, "area": area, "region": region}
+
+def until_the_preview(view: dict[str, Any]) -> Iterator[str]:
+    """A scene, a region, cameras, and what is to be filled."""
     with bpy.context.temp_override(**view):
         bpy.ops.gimp3d.import_ply(filepath=str(SHARE / "scene.ply"))
     bpy.context.scene.view_settings.view_transform = "Standard"
     bpy.context.scene.eevee.taa_samples = 1  # drawing on and on, which takes seconds here, is not what is measured
-    splats = importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats")
-    splats.set_display(bpy.context.object, "As Points", True)
+    importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats").set_display(bpy.context.object, "As Points", True)
     frames = json.loads((SHARE / "transforms.json").read_text())["frames"]
-    space.region_3d.view_matrix = Matrix(frames[0]["transform_matrix"]).inverted()
+    view["area"].spaces.active.region_3d.view_matrix = Matrix(frames[0]["transform_matrix"]).inverted()
     yield ""
     yield "2-imported"
 
@@ -68,6 +78,10 @@ def steps() -> Iterator[str]:
     yield ""
     yield "4-preview"
 
+
+def through_a_removal(view: dict[str, Any]) -> Iterator[str]:
+    """One that is cancelled, one that is not, its result, and the preferences."""
+    splats = importlib.import_module(f"{EXTENSION}.gimp3d_addon.splats")
     base = importlib.import_module(f"{EXTENSION}.gimp3d_addon.operators.base")
     with bpy.context.temp_override(**view):
         bpy.ops.gimp3d.hide_previews()
@@ -104,7 +118,7 @@ def steps() -> Iterator[str]:
         bpy.ops.gimp3d.hide_previews()
         bpy.ops.gimp3d.check()
         bpy.ops.screen.userpref_show("INVOKE_DEFAULT")
-    preferences.active_section = "ADDONS"
+    bpy.context.preferences.active_section = "ADDONS"
     bpy.context.window_manager.addon_search = "3D-GIMP"
     with bpy.context.temp_override(**view):
         bpy.ops.preferences.addon_expand(module=EXTENSION)
