@@ -22,9 +22,9 @@ from gimp3d.behind import LIGHT
 from gimp3d.camera import output_name
 from gimp3d.commands import render_views
 from gimp3d.evaluate import psnr, score
-from gimp3d.gaussians import linear
 from gimp3d.io.images import read_image, write_png
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
+from gimp3d.srgb import linear
 
 from .ablation import RULES, switched_off
 from .command import ASSETS, parser_of, say, told_in_one_line, write

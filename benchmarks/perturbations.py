@@ -18,7 +18,7 @@ from gimp3d.camera import Camera
 from gimp3d.gaussians import Gaussians
 from gimp3d.raster import Backend, Drawing, Rendering, current_backend, use_backend
 from gimp3d.run import Observer
-from gimp3d.stages.reference import DepthCompletion
+from gimp3d.stages.depth import DepthCompletion
 
 GRAIN = 3.0  # px, σ of the blur that makes depth errors as coarse as splats are
 GARBLED = 16  # px, side of the squares that hold another part of a garbled photo

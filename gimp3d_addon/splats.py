@@ -17,8 +17,9 @@ import numpy as np
 from mathutils import Matrix
 
 from gimp3d.errors import BadInput
-from gimp3d.gaussians import SH_C0, Gaussians, decoded, sh_basis
+from gimp3d.gaussians import SH_C0, Gaussians, sh_basis
 from gimp3d.io.ply import PlyTable, SplatFile, ascii_rows, file_of, gaussians_of, row_blocks, values
+from gimp3d.srgb import decoded
 
 from .native import attribute_values, is_native, read_native, write_native
 from .shading import COLOUR, GROUP, RADIUS, node_group, splat_material

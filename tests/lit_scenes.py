@@ -15,10 +15,11 @@ from scenes import BLOCK, REGION, discs, floor_colours
 
 from gimp3d.box import Box, Region
 from gimp3d.camera import Camera
-from gimp3d.gaussians import SH_C0, Gaussians, decoded, encoded
+from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.orbit import orbit_cameras
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
+from gimp3d.srgb import decoded, encoded
 
 STEP = 0.025  # between splats
 RAYS = 64  # to a soft light

@@ -1,4 +1,4 @@
-"""The scene: a set of 3D (or 2D, surfel) Gaussians, as 3DGS files store them; its colours, as a picture's, are sRGB."""
+"""The scene: a set of 3D (or 2D, surfel) Gaussians, as 3DGS files store them."""
 
 from __future__ import annotations
 
@@ -141,18 +141,3 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
         bands += [SH_C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), SH_C3[4] * x * (4 * z * z - x * x - y * y)]
         bands += [SH_C3[5] * z * (x * x - y * y), SH_C3[6] * x * (x * x - 3 * y * y)]
     return np.stack(bands, -1)
-
-
-def linear(picture: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1], which shadows and exposures multiply, of a picture [..., 3] uint8 (IEC 61966-2-1)."""
-    return decoded(np.arange(256) / 255.0)[picture]
-
-
-def decoded(colour: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1]."""
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-
-
-def encoded(light: np.ndarray) -> np.ndarray:
-    """sRGB values of linear light."""
-    return np.where(light <= 0.0031308, light * 12.92, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)

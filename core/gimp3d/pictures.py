@@ -15,10 +15,10 @@ from .geometry import disparity_of, window_mask
 from .raster import footprint, touched_window
 from .run import Picture, ViewState
 from .stages.charts import Chart
+from .stages.depth import DepthCompletion
 from .stages.masks import Masks
 from .stages.propagate import Propagation, Rule
 from .stages.propagate.paper import MappingField
-from .stages.reference import DepthCompletion
 from .stages.witness import spread
 from .steps.behind import Relit
 from .steps.references import Completed

@@ -12,10 +12,10 @@ from .job import SHADOWS, RemovalJob
 from .schema import Seed, Share, Variant, within
 from .stages.charts import ChartSettings
 from .stages.clearing import ClearingSettings
+from .stages.depth import DepthSettings
 from .stages.masks import MaskSettings
 from .stages.propagate import PropagateSettings
 from .stages.propagate.paper import MappingSettings
-from .stages.reference import DepthSettings
 from .stages.refine import RefineSettings
 from .stages.seed import SeedSettings
 from .stages.selection import SelectionSettings

@@ -46,11 +46,10 @@ def inpaint_reference(
     who = None if spec in PROVIDERS else painter(spec, call)
     if not hole.any():
         return Appearance(image.copy(), 1.0, "nothing to fill in the reference")
-    given = spec.startswith("file:")  # whose picture is held against all of the image
-    if hole.all() and not given:
+    if hole.all() and not spec.startswith("file:"):
         raise IllPosed("appearance: the hole covers the whole reference; give a picture of it or choose another view")
     if who:
-        filled = _painted(who, call, image, hole, seed + variant, None if given else unknown)
+        filled = _painted(who, call, image, hole, seed + variant, unknown)
     else:
         filled = without_specks(PROVIDERS[spec], image, hole, seed, unknown, variant)
     return replace(filled, image=np.where(hole[..., None], filled.image, image))

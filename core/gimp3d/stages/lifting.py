@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..gaussians import SH_C0, Gaussians, encoded, linear, sh_basis
+from ..gaussians import SH_C0, Gaussians, sh_basis
 from ..geometry import Window, dilated, directions, window_round
 from ..raster import PixelRegion, label_weights, pixel_region
+from ..srgb import encoded, linear
 from .charts.find import TOLERANCE
 from .charts.plane import Hits, first_hits, pictured
 from .ground import Ground

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..gaussians import linear
 from ..solvers.lights import LitSurface, Shading
+from ..srgb import linear
 from .charts.plane import Plane
-from .ground import Ground, Occluder
+from .ground import Ground
+from .occluder import Occluder
 
 DARK = 2e-3  # of linear light, noise of a photo's
 LEVELS = (2, 4, 8, 16)  # texels of halved grounds: sides of the blocks whose luminance is compared

@@ -13,12 +13,14 @@ from scipy.optimize import nnls
 from ..box import Region
 from ..camera import Camera
 from ..compute.threads import parallel_map
-from ..gaussians import Gaussians, decoded, linear
+from ..gaussians import Gaussians
 from ..geometry import colours_at
 from ..raster import render
+from ..srgb import decoded, linear
 from .charts.plane import Plane, extent
-from .ground import ROUGH, Ground, standing
+from .ground import ROUGH, Ground
 from .light_search import EARNS, FITS, places_elsewhere
+from .occluder import standing
 from .witness import Says, Witness, ask, spread
 
 MOST_VIEWS = 24

@@ -16,7 +16,7 @@ from ..gaussians import SH_C0, Gaussians, matrices_to_quats, pad_sh, sh_basis
 from ..geometry import SAME_DEPTH, bounds, cropped, directions, sees, surface_normals, window_mask
 from ..raster import PictureGradients, PixelRegion, RasterSettings, contributions, pixel_region, touched_window
 from ..schema import Between, Positive
-from ..solvers.robust import HarmonicsSettings, Seen, fit_harmonics
+from ..solvers.harmonics import HarmonicsSettings, Seen, fit_harmonics
 from .propagate import PaintedView, Rule
 
 OWN_RULES = (Rule.EVIDENCE, Rule.OWN_PIXELS, Rule.RETARGETED)  # pixels that a view's own tell the colour of

@@ -19,13 +19,15 @@ import scipy.ndimage
 from scipy.spatial import cKDTree
 
 from ..box import Region
-from ..gaussians import Gaussians, linear
+from ..gaussians import Gaussians
 from ..geometry import colours_at, dilated
 from ..solvers.lights import Shading
+from ..srgb import linear
 from .charts import Chart
 from .charts.plane import Plane, extent
-from .ground import FEWEST, ROUGH, Ground, Occluder
+from .ground import FEWEST, ROUGH, Ground
 from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
+from .occluder import Occluder
 from .witness import Says, Witness, ask
 
 DULL = 0.5  # share of the light that the object takes from a surface and does not give back

@@ -25,9 +25,10 @@ from ..raster import label_weights
 from ..run import ViewState
 from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
 from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
-from ..stages.ground import look_at, support_first
+from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
 from ..stages.masks import Masks, ViewMasks
+from ..stages.occluder import support_first
 from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.reflection import Reflection, find_reflection
 from ..stages.seed import OWN_RULES

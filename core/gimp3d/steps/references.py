@@ -28,10 +28,11 @@ from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
 from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
+from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
 from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
-from ..stages.reference import DepthCompletion, PriorFit, complete_depth, rim
+from ..stages.reference import rim
 
 SAME = 0.01  # relative z within which two references show the same surface
 SAME_TEXELS = 1.0  # of a chart, within which it is that of another one: its camera stands too far away for shares of z

@@ -1,6 +1,7 @@
 """Providers of appearance: each fills the hole, only the hole, and says clearly when it cannot."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from property_tests import examples
 
 from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import IllPosed
+from gimp3d.io.images import write_png
 from gimp3d.priors.inpaint import PROVIDERS, inpaint_reference
 
 
@@ -95,6 +97,18 @@ def test_an_empty_hole_is_a_no_op_and_a_full_one_is_refused(spec: str) -> None:
 def test_unknown_providers_are_refused_with_the_choices(spec: str) -> None:
     choices = "exemplar, telea, ns, shiftmap, fsr, file:PATH, onnx:PATH, torchscript:PATH"
     refuse(choices, spec, scenery(), disc())
+
+
+def test_a_file_is_held_against_what_is_known_alone(tmp_path: Path) -> None:
+    """A chart is black where no photo shows it; the picture of it is not."""
+    picture, hole = scenery(), disc()
+    unknown = np.zeros_like(hole)
+    unknown[:, : hole.shape[1] // 3] = True
+    write_png(tmp_path / "painted.png", picture)
+    chart = np.where((hole | unknown)[..., None], np.uint8(0), picture)
+    found = inpaint_reference(f"file:{tmp_path / 'painted.png'}", chart, hole, unknown=unknown & ~hole)
+    assert not found.warnings and "residual 0.0" in found.reason
+    assert (found.image[hole] == picture[hole]).all()
 
 
 # exemplar

@@ -171,7 +171,7 @@ def scripted(folder, body):
 @pytest.mark.parametrize("provider", ["onnx", "torchscript", "command"])
 def test_who_predicts_disparity_guides_the_completion(tmp_path, provider):
     """From the file to the depth: somebody has learned this scene, up to scale and shift, which the ring tells."""
-    from gimp3d.stages.reference import complete_depth
+    from gimp3d.stages.depth import complete_depth
 
     v, u = np.mgrid[:120, :160]
     truth = 0.3 + 0.1 * np.exp(-((u - 86) ** 2 + (v - 66) ** 2) / 300) + 0.05 * np.sin(u / 15)

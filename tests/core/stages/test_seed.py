@@ -18,7 +18,7 @@ from gimp3d.errors import BadInput
 from gimp3d.gaussians import SH_C0, Gaussians, pad_sh, quats_to_matrices, sh_basis
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
-from gimp3d.solvers.robust import HarmonicsSettings
+from gimp3d.solvers.harmonics import HarmonicsSettings
 from gimp3d.stages.propagate import PaintedView, Rule, ViewToPaint
 from gimp3d.stages.seed import (
     CUT,

@@ -14,8 +14,9 @@ from scenes import BLOCK, floor_colours
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
-from gimp3d.gaussians import SH_C0, Gaussians, decoded, encoded, linear
+from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, View, remove_object, render_bytes
+from gimp3d.srgb import decoded, encoded, linear
 from gimp3d.stages.charts import Chart, Plane
 from gimp3d.stages.light_search import Light
 from gimp3d.stages.shadow import Shadow, find_contact

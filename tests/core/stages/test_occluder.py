@@ -9,8 +9,8 @@ from scenes import BLOCK, REGION, block, floor
 
 from gimp3d.box import Box
 from gimp3d.stages.charts import Plane, extent
-from gimp3d.stages.ground import Occluder, support_first
 from gimp3d.stages.light_search import Light, taken_from
+from gimp3d.stages.occluder import Occluder, support_first
 
 UP = np.array([0.0, 0.0, 1.0])
 FLOOR = Plane.make(np.zeros(3), UP, REGION)
