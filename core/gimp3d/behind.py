@@ -17,7 +17,9 @@ from .steps.behind import (
     NOT_LIT,
     Charted,
     Relit,
+    Surfaces,
     chart_surfaces,
+    clear_round,
     find_light,
     find_surfaces,
     relearn,
@@ -27,7 +29,7 @@ from .steps.behind import (
 
 LIGHT = ("light", "lift", "contact", "lift 2", "charts 2", "lift 3")  # stages that a removal with --shadow off lacks
 # stages that know nothing of fills
-BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "surfaces 2", "charts 3", "relearn")
+BEFORE_FILL = ("masks", "exposure", "surfaces", "charts", *LIGHT, "surfaces 2", "charts 3", "clear", "relearn")
 
 
 @dataclass(frozen=True)
@@ -69,32 +71,34 @@ def look_behind(
     surfaces = run("surfaces", find_surfaces, *inputs)
     masks = replace(masks, selection=surfaces.selection)
 
-    def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Charted]:
-        """What the object does to the light undone, and the charts as they are then."""
+    def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Surfaces, Charted]:
+        """What the object does to the light undone, and the surfaces and their charts as they are then."""
         light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
         lit = replace(found, lifted=light)
         bounded = surfaces if light is None else surfaces.with_marked(light.dark)
-        inputs = lit.scene(scene), region, bounded, lit.views(views), settings
-        return lit, run(f"charts{suffix}", chart_surfaces, *inputs)
+        return lit, bounded, run(f"charts{suffix}", chart_surfaces, region, bounded, lit.views(views))
 
     found = NOT_LIT
     if settings.shadow != "off":
         found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
         if isinstance(found.shadow, str) and settings.shadow == "mask":
             run.warnings.append(found.shadow)
-    lit, charted = in_light(found)
+    lit, bounded, charted = in_light(found)
     if isinstance(found.shadow, str) and settings.shadow == "auto":
         found = run("contact", with_contact, found, charted.charts)
-        again = not isinstance(found.shadow, str)
-        lit, charted = in_light(found, " 2") if again else (replace(found, lifted=lit.lifted), charted)
+        if isinstance(found.shadow, str):
+            lit = replace(found, lifted=lit.lifted)
+        else:
+            lit, bounded, charted = in_light(found, " 2")
     if surfaces.planes and not charted.charts:  # photos of plain textures agree anywhere
         surfaces = run("surfaces 2", find_surfaces, *inputs, False)
         masks = replace(masks, selection=surfaces.selection)
-        lit, charted = in_light(found, " 3")
+        lit, bounded, charted = in_light(found, " 3")
     scene, views = lit.scene(scene), lit.views(views)
     if charted.charts:
-        masks = replace(masks, selection=charted.selection, views=tuple(m for m, _ in charted.targets))
-        views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, charted.targets))
+        cleared = run("clear", clear_round, scene, region, bounded, charted.charts, views, settings)
+        masks = replace(masks, selection=cleared.selection, views=tuple(m for m, _ in cleared.targets))
+        views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, cleared.targets))
     behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
     if not settings.refine.steps:
         return behind

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 CHARTED = ("draft", "balanced", "best")  # presets that complete charts; others complete one view
-ON_CHARTS = ("surfaces", "light", "lift", "charts", "verdict")  # stages of the former alone …
+ON_CHARTS = ("surfaces", "light", "lift", "charts", "clear", "verdict")  # stages of the former alone …
 ON_VIEWS = ("reference", "depth", "mapping")  # … and of the latter
 ORDER = (
-    "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "relearn", "reference", "depth", "appearance",
-    "seed", "mapping", "propagate", "settle", "refine", "recolour", "verdict",
+    "read", "masks", "exposure", "surfaces", "light", "lift", "charts", "clear", "relearn", "reference", "depth",
+    "appearance", "seed", "mapping", "propagate", "settle", "refine", "recolour", "verdict",
 )  # fmt: skip
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
@@ -26,7 +26,8 @@ STAGES = {
     "surfaces": (0.631, 0.052, 0.022),
     "light": (1.713, 0.035, 0.0),
     "lift": (0.0, 0.0, 0.0),
-    "charts": (0.175, 0.195, 0.15),
+    "charts": (0.175, 0.195, 0.0),
+    "clear": (0.0, 0.0, 0.15),
     "reference": (0.376, 0.033, 0.0),
     "depth": (0.165, 0.06, 0.0),
     "appearance": (0.51, 0.007, 0.0),

@@ -15,7 +15,19 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.progress import forecast_removal
 
-IN_ORDER = ["masks", "exposure", "surfaces", "light", "charts", "contact", "appearance", "seed", "propagate", "settle"]
+IN_ORDER = [
+    "masks",
+    "exposure",
+    "surfaces",
+    "light",
+    "charts",
+    "contact",
+    "clear",
+    "appearance",
+    "seed",
+    "propagate",
+    "settle",
+]
 
 
 def views() -> list[View]:

@@ -131,7 +131,7 @@ def test_a_job_runs_alone_moves_and_resumes(
     job.rename(moved)
     for stage in ("find_masks", "judge"):
         monkeypatch.setattr(pipeline, stage, again)
-    for stage in ("exposures_of", "find_surfaces", "find_light", "chart_surfaces"):
+    for stage in ("exposures_of", "find_surfaces", "find_light", "chart_surfaces", "clear_round"):
         monkeypatch.setattr(behind, stage, again)
     for stage in ("paint_chart", "paint_views"):
         monkeypatch.setattr(references, stage, again)

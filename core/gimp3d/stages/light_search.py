@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..compute.threads import parallel_map
 from ..solvers.lights import LitSurface, Shading
 from ..srgb import linear
 from .charts.plane import Plane
@@ -159,7 +160,8 @@ class Scenery:
         changes = lit.changes(shadows)
         strength, besides = lit.fit(shadows)
         left = lit.residual(shadows @ strength, besides)
-        chance = max(float(lit.gains(bright[0], left).max()), *(float(lit.gains(b, -left).max()) for b in bright))
+        tried = [(bright[0], left), *((b, -left) for b in bright)]
+        chance = max(parallel_map(lambda by: float(lit.gains(*by).max()), tried))
         found = []
         for k in range(len(lights)):
             others = np.delete(shadows, k, axis=1)
@@ -186,7 +188,7 @@ def search(scenery: Scenery) -> tuple[list[Light], np.ndarray]:
     shadows = cast(scenery.occluder)
     own = lit.changes(shadows)
     moved = [scenery.occluder.moved(x, y) for x, y in places_elsewhere(float(max(scenery.occluder.size[:2])))]
-    bright = [own, *(lit.changes(cast(m)) for m in moved)]
+    bright = [own, *parallel_map(lambda m: lit.changes(cast(m)), moved)]
     found: list[int] = []
     for _ in range(MOST):
         strength, besides = lit.fit(shadows[:, found])

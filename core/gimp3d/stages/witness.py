@@ -16,13 +16,15 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.threads import parallel_map, run_ranges
-from ..geometry import Window, cropped, pack_camera, project
+from ..geometry import Window, bounds, cropped, pack_camera, project
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUDEST = 127  # grey levels beyond which a difference counts no more; kept as int8
 AT_ONCE = 8  # views whose results are in memory together
+TOGETHER = 128  # points that are compared at once
 SUBPIXEL = 256  # steps of a pixel in which photos are read
 AGREEING = 3  # photos that must show a point for their agreement to be asked
+APART = 17  # px beyond what photos show, half of the widest blur's reach: it is not mirrored into that
 SEAM = 4.0  # px, σ below which detail is the best photo's, above which colour is what most photos say
 FEW = 12.0  # grey levels by which a photo may always differ from what most say
 LOUD = 3.0  # times the spread of textures, by which its detail may besides: more is the edge of something before it
@@ -166,31 +168,43 @@ class Textures:
 
 @exact_kernel  # points may be NaN
 def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
-    for i in range(lo, hi):
-        x, y, w = points[i, 0], points[i, 1], points[i, 2]
-        count, total, squares = 0, 0.0, 0.0
+    place, side, down = np.empty(TOGETHER, np.int64), np.empty(TOGETHER), np.empty(TOGETHER)
+    count, total, squares = np.empty(TOGETHER), np.empty(TOGETHER), np.empty(TOGETHER)
+    x, y, z = np.empty(TOGETHER), np.empty(TOGETHER), np.empty(TOGETHER)
+    for first in range(lo, hi, TOGETHER):
+        n = min(TOGETHER, hi - first)
+        for i in range(n):
+            x[i], y[i], z[i] = points[first + i]
+            count[i] = total[i] = squares[i] = 0.0
         for k in range(len(cameras)):
-            c = cameras[k]
-            u, v, _ = project(c, x, y, w)
-            # to 1/256 px: a ray through a pixel's centre must not fall to either side of it by rounding
-            u, v = np.rint((u - 0.5) * SUBPIXEL) / SUBPIXEL, np.rint((v - 0.5) * SUBPIXEL) / SUBPIXEL
-            width, height = int(c[16]), int(c[17])
-            if not (0 <= u < width - 1 and 0 <= v < height - 1):
-                continue
-            col, row = int(u), int(v)
-            s, t = u - col, v - row
-            at = starts[k] + row * width + col
-            a, b = values[at], values[at + 1]
-            d, e = values[at + width], values[at + width + 1]
-            if a == -128 or b == -128 or d == -128 or e == -128:
-                continue
-            value = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * d + s * e)
-            count += 1
-            total += value
-            squares += value * value
-        if count >= least:
-            energy[i, 0] = total * total / count
-            energy[i, 1] = squares
+            r00, r01, r02, r10, r11, r12, r20, r21, r22, t0, t1, t2, fx, fy, cx, cy, width, height = cameras[k]
+            row = int(width)
+            for i in range(n):  # without branches and without calls: several points at a time
+                depth = r20 * x[i] + r21 * y[i] + r22 * z[i] + t2
+                u = fx * (r00 * x[i] + r01 * y[i] + r02 * z[i] + t0) / depth + cx
+                v = fy * (r10 * x[i] + r11 * y[i] + r12 * z[i] + t1) / depth + cy
+                # to 1/256 px: a ray through a pixel's centre must not fall to either side of it by rounding
+                u, v = np.rint((u - 0.5) * SUBPIXEL) / SUBPIXEL, np.rint((v - 0.5) * SUBPIXEL) / SUBPIXEL
+                framed = (depth > 1e-9) & (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+                u, v = u if framed else 0.0, v if framed else 0.0
+                left, top = np.floor(u), np.floor(v)
+                side[i], down[i] = u - left, v - top
+                place[i] = int(top) * row + int(left) if framed else -1
+            for i in range(n):
+                if place[i] < 0:
+                    continue
+                at, s, t = starts[k] + place[i], side[i], down[i]
+                a, b, d, e = values[at], values[at + 1], values[at + row], values[at + row + 1]
+                if a == -128 or b == -128 or d == -128 or e == -128:
+                    continue
+                value = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * d + s * e)
+                count[i] += 1
+                total[i] += value
+                squares[i] += value * value
+        for i in range(n):
+            if count[i] >= least:
+                energy[first + i, 0] = total[i] * total[i] / count[i]
+                energy[first + i, 1] = squares[i]
 
 
 def mosaic(
@@ -209,9 +223,20 @@ def mosaic(
     photo at a time, brought to the median's colours by a smooth correction: the one with most pixels there of those
     that need little of it. So no seam shows between photos (two bands of Burt & Adelson 1983).
     """
-    h, w = points.shape[:2]
+    image, (spread, loud) = np.zeros(points.shape, np.uint8), np.zeros((2, *points.shape[:2]), np.float32)
     clear = (said == Says.SEEN).any(0)  # elsewhere what is beside the object has to do
     told = np.where(clear, said == Says.SEEN, said == Says.BESIDE)
+    window = bounds(told.any(0), APART)
+    if told.any():
+        image[window], spread[window], loud[window] = _mosaic(points[window], normal, witnesses, told[:, *window])
+    return image, spread, loud
+
+
+def _mosaic(
+    points: np.ndarray, normal: np.ndarray, witnesses: Sequence[Witness], told: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See mosaic; `told` [V, H, W] bool: by which photos."""
+    h, w = points.shape[:2]
     flat = points.reshape(-1, 3)
 
     def of(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

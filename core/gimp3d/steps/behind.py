@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from ..box import Region
+from ..compute.threads import parallel_map
 from ..errors import IllPosed
 from ..gaussians import SH_C0, Gaussians
 from ..geometry import SOLID
@@ -112,29 +113,46 @@ def find_surfaces(
 
 @dataclass(frozen=True)
 class Charted:
-    """The surfaces that the object hid, seen straight on, and what follows from them."""
+    """The surfaces that the object hid, seen straight on."""
 
     charts: tuple[Chart, ...]
+    confidence: float
+    reason: str
+
+
+def chart_surfaces(region: Region, surfaces: Surfaces, views: Sequence[ViewState]) -> Charted:
+    """Show the hidden surfaces."""
+    charts = draw_charts(surfaces.laid, surfaces.witnesses(views), region, surfaces.marked)
+    words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
+    if not charts:
+        return Charted((), 0.0, "no surface runs into what the object hid")
+    return Charted(charts, charts[0].agreement, "; ".join(words))
+
+
+@dataclass(frozen=True)
+class Cleared:
+    """What follows from charts."""
+
     selection: Selection  # with what had to be cleared away
     targets: Sequence[tuple[ViewMasks, Hits]]  # see chart_targets
     confidence: float
     reason: str
 
 
-def chart_surfaces(
-    scene: Gaussians, region: Region, surfaces: Surfaces, views: Sequence[ViewState], settings: RemovalSettings
-) -> Charted:
-    """Show the hidden surfaces, clear the air before them, and say where they have to be filled."""
-    witnesses, marked, masks = surfaces.witnesses(views), surfaces.marked, [v.masks for v in views]
-    charts = draw_charts(surfaces.laid, witnesses, region, marked)
-    if not charts:
-        return Charted((), surfaces.selection, (), 0.0, "no surface runs into what the object hid")
-    witnesses = hiding_rests(witnesses, charts)
+def clear_round(
+    scene: Gaussians,
+    region: Region,
+    surfaces: Surfaces,
+    charts: Sequence[Chart],
+    views: Sequence[ViewState],
+    settings: RemovalSettings,
+) -> Cleared:
+    """Clear the air before charts, and say where they have to be filled."""
+    witnesses = hiding_rests(surfaces.witnesses(views), charts)
     selection = clear_air(scene, region, surfaces.selection, witnesses, charts, settings.clearing)
-    targets = chart_targets(scene, selection, masks, witnesses, charts, marked)
-    words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
+    targets = chart_targets(scene, selection, [v.masks for v in views], witnesses, charts, surfaces.marked)
     cleared = int((selection.removed & ~surfaces.selection.removed).sum())
-    return Charted(charts, selection, targets, charts[0].agreement, "; ".join([*words, f"{cleared} of haze go"]))
+    return Cleared(selection, targets, 1.0, f"{cleared} of haze go")
 
 
 @dataclass(frozen=True)
@@ -258,7 +276,7 @@ def relearn(
 
     place, elsewhere = total_over(showing, weights, (2, len(kept)))
     learns = near & (place > SHOWN) & (place > SHARE * (place + elsewhere))
-    observations = [observed_round(v, charts) for v in emptied(kept, showing)]
+    observations = parallel_map(lambda v: observed_round(v, charts), emptied(kept, showing))
     how = settings.refine, settings.random_seed, lambda _, *step: progress("relearn", *step), LEARNED, ROUND
     refined = refine_gaussians(kept.take(~learns), kept.take(learns), observations, *how)
     rows = np.flatnonzero(~removed)[learns] if refined.steps else np.zeros(0, int)

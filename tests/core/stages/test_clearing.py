@@ -387,10 +387,9 @@ def test_views_after_are_those_of_the_emptied_scene(plain: Removal, targets: Tar
         np.testing.assert_allclose(view.depth_after[both], depth[both], rtol=1e-5)
 
 
-def test_without_charts_there_are_no_targets(plain: Removal) -> None:
+def test_without_charts_there_is_no_confidence(plain: Removal) -> None:
     views = [ViewState.first(v, w.photo, Exposure(np.ones(3))) for v, w in zip(plain.views, plain.witnesses)]
     objects = [(w.hidden, w.beside) for w in plain.witnesses]
     surfaces = Surfaces((), (), plain.selection, objects, (NONE,) * len(EYES), 1.0, "")
-    found = chart_surfaces(plain.scene, REGION, surfaces, views, PRESETS["balanced"])
-    assert not found.charts and not found.targets and found.confidence == 0
-    np.testing.assert_array_equal(found.selection.fates, plain.selection.fates)
+    found = chart_surfaces(REGION, surfaces, views)
+    assert not found.charts and found.confidence == 0 and found.reason.startswith("no surface")

@@ -454,7 +454,7 @@ def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
     (domain, *_), system = solver.call_args
     assert (domain == (stage.cv2.distanceTransform((~painted).astype(np.uint8), 2, 5) <= stage.FAR * width)).all()
     correction = np.zeros(base.shape)
-    correction[domain] = solved_directly(domain, **system)
+    correction[domain] = solved_directly(domain, system["weight"], system["anchor"])
     expected = np.clip(np.rint(raw + correction), 0, 255)
     assert np.abs(blended[painted].astype(int) - expected[painted]).max() <= 1
     assert (blended[~painted] == base[~painted]).all()

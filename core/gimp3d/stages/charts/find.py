@@ -228,7 +228,7 @@ def _best_known(
 
 
 def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
-    told = [agreement(s) for s in starts]
+    told = parallel_map(agreement, starts)
     return [starts[k] for k in np.argsort(told)[::-1][:count]]
 
 
@@ -237,7 +237,7 @@ def _climbed(agreement: Callable[[np.ndarray], float], start: np.ndarray, least:
     at, best, step = start, agreement(start), STEP
     while step > least:
         moves = [at + step * sign * np.eye(3)[k] * (1 if k == 0 else 2) for k in range(3) for sign in (1, -1)]
-        told = [agreement(m) for m in moves]
+        told = parallel_map(agreement, moves)
         k = int(np.argmax(told))
         if told[k] > best:
             at, best = moves[k], told[k]
@@ -331,11 +331,12 @@ def _drawn_surface(
         points = surface_points(view.camera, view.depth_beside, window, step)[2]
         points = points[np.abs(flat.plane.local(points)[:, 2]) < height]
         _, rows, cols, z = framed(camera, points)
-        return np.stack([rows // CELL * w + cols // CELL, z], -1)
+        # sorted as one number: the cell, then z, whose bits are in order as it is positive
+        return (rows // CELL * w + cols // CELL).astype(np.uint64) << 32 | z.astype(np.float32).view(np.uint32)
 
-    found = np.concatenate(parallel_map(of, witnesses))
-    key, z = found[np.lexsort((found[:, 1], found[:, 0]))].T
-    count = np.bincount(key.astype(int), minlength=h * w)
+    found = np.sort(np.concatenate(parallel_map(of, witnesses)))
+    count = np.bincount((found >> 32).astype(np.int64), minlength=h * w)
     known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
-    value[known] = z[(np.cumsum(count) - count + count // 2)[known]]
+    middle = found[(np.cumsum(count) - count + count // 2)[known]]
+    value[known] = middle.astype(np.uint32).view(np.float32)
     return np.where(known, value - away, 0).reshape(h, w), known.reshape(h, w)

@@ -31,6 +31,8 @@ LEAST_BAND = 20  # px of photo that tell the level of a part
 HOLD = 1 / 16  # weight that holds a correction at its level where no photo is near; over the root of the band's weight
 TOLERANCES = 4.0, 2.0, 1.0  # of a mismatch, round by round
 LOCAL = 2.0  # widths of the band, σ of the neighbourhood that tells what is usual
+CELLS = 4.0  # to a σ, in which it is blurred
+SETTLED = 1e-3  # residual of the blend: a grey level in one of 10,000 pixels
 LEAST_COUNT = 1e-3  # share of a neighbourhood from which on it tells
 FAR = 4  # widths of the band within which photo still tells
 SQUARE = np.ones((3, 3), np.uint8)
@@ -147,9 +149,8 @@ def blend_band(
         nearness = 1 / (1 + (distance[data] / width) ** 2)
         weight[data] = 2 / width**2 * nearness * _alike(mismatch, level, data, LOCAL * width)
     anchor = (weight[..., None] * mismatch + hold * level) / (weight + hold)[..., None]
-    correction = solve_poisson(
-        domain, np.zeros_like(domain), np.zeros_like(mismatch), weight=weight + hold, anchor=anchor
-    ).values
+    no, flat = np.zeros_like(domain), np.zeros_like(mismatch)
+    correction = solve_poisson(domain, no, flat, tolerance=SETTLED, weight=weight + hold, anchor=anchor).values
     correction[~domain] = 0
     _continue_over(painted & ~domain, domain, depth, correction)
     result[painted] = to_bytes(raw[painted] + correction[painted])
@@ -178,12 +179,18 @@ def _alike(mismatch: np.ndarray, level: np.ndarray, data: np.ndarray, width: flo
 
     A local mean, reweighted (Holland and Welsch 1977): what differs from most may be the light of another place.
     """
-    mean = level
+    mean, shape = level, data.shape
+    # as coarse as the neighbourhood allows
+    small = [max(1, round(n / max(1.0, width / CELLS))) for n in shape]
+    sigma = width * small[0] / shape[0], width * small[1] / shape[1]
     for tolerance in TOLERANCES:
-        counts = np.zeros(data.shape)
+        counts = np.zeros(shape)
         counts[data] = biweight((mismatch - mean)[data], tolerance)
-        total = cv2.GaussianBlur(counts, (0, 0), width)[..., None] + LEAST_COUNT
-        mean = (cv2.GaussianBlur(counts[..., None] * mismatch, (0, 0), width) + LEAST_COUNT * level) / total
+        told = np.concatenate([counts[..., None], counts[..., None] * mismatch], axis=-1).astype(np.float32)
+        told = cv2.resize(told, small[::-1], interpolation=cv2.INTER_AREA)
+        told = cv2.GaussianBlur(told, (0, 0), sigma[1], sigmaY=sigma[0])
+        told = cv2.resize(told, shape[::-1], interpolation=cv2.INTER_LINEAR)
+        mean = (told[..., 1:] + LEAST_COUNT * level) / (told[..., :1] + LEAST_COUNT)
     return counts[data]
 
 
