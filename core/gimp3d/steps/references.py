@@ -30,7 +30,7 @@ from ..run import ViewState
 from ..stages.charts import CHART, Chart, chart_number, pictured
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
 from ..stages.masks import ViewMasks
-from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate
+from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate, round_hole
 from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
 from ..stages.reference import rim
 
@@ -223,7 +223,8 @@ def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -
     elif v.target.any():
         window = window_mask(near_hole(v.target), v.camera)
         after = surface_depth(with_seeds, v.camera, pixels=window)[0]
-    return ViewToPaint(v.camera, view.bare, view.painted, v.silhouette, v.target, before, after)
+    drawn = render_bytes(with_seeds, v.camera, pixels=round_hole(v.target, v.silhouette))
+    return ViewToPaint(v.camera, view.bare, view.painted, v.silhouette, v.target, before, after, drawn)
 
 
 def snapped(depth: np.ndarray, there: np.ndarray, tolerance: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from unittest import mock
 
+import cv2
 import numpy as np
 import pytest
 import scipy.sparse
@@ -82,7 +83,7 @@ def view(
     photo[inside] = [200, 0, 0]
     before = np.where(inside, 0.5 * depth, depth).astype(np.float32)
     base = np.where(inside[..., None], 0, photo).astype(np.uint8)
-    return ViewToPaint(camera, photo, base, inside, inside, before, depth)
+    return ViewToPaint(camera, photo, base, inside, inside, before, depth, photo)
 
 
 def run(
@@ -112,6 +113,20 @@ def test_the_hole_is_painted_with_the_true_picture(reference: Reference, index: 
     hole = target.target & (rules != Rule.UNREACHED)
     assert hole.sum() > 0.8 * target.target.sum()
     assert error(image, target, hole) < 7
+
+
+def test_the_hole_is_as_sharp_as_the_scene_is_drawn_beside_it(reference: Reference) -> None:
+    sharp = view(reference, 2)
+    soft = replace(sharp, drawn=cv2.GaussianBlur(sharp.image, (0, 0), 4.0))
+    inner = cv2.erode(sharp.target.astype(np.uint8), np.ones((5, 5))) > 0
+
+    def detail(target: ViewToPaint, settings: PropagateSettings) -> float:
+        picture = paint(reference, target, settings)[1].astype(float)
+        return float(np.abs(picture - cv2.GaussianBlur(picture, (0, 0), 1.0))[inner].mean())
+
+    own = PropagateSettings()
+    assert detail(soft, own) < 0.6 * detail(sharp, own)
+    assert detail(soft, SAMPLE) == detail(sharp, SAMPLE)  # the paper takes colours as they are
 
 
 @pytest.mark.parametrize("blend", ["band", "rim"])
@@ -369,7 +384,7 @@ def test_holes_of_any_size_at_any_place_are_painted(
     target[top:bottom, left:right] = True
     base = np.where(target[..., None], 0, photo).astype(np.uint8)
     before = np.where(target, 0.5 * depth, depth).astype(np.float32)
-    plain = ViewToPaint(camera, photo, base, target, target, before, depth)
+    plain = ViewToPaint(camera, photo, base, target, target, before, depth, photo)
     _, image, rules = paint(reference, plain, PropagateSettings(transfer=transfer))
     assert image.dtype == np.uint8 and (rules[target] != Rule.UNTOUCHED).all()
     reached = target & (rules != Rule.UNREACHED)

@@ -232,7 +232,7 @@ def _hole_and_truth(count: int = 9) -> tuple[list[ViewToPaint], list[PaintedView
         target = (drawn.alpha > 0.9) & (render(floor(with_hole=True), camera).alpha < 0.9)
         rules = np.where(target, Rule.OWN_PIXELS, Rule.UNTOUCHED).astype(np.uint8)
         depth = drawn.median_depth
-        views.append(ViewToPaint(camera, image, image, target, target, depth, depth))
+        views.append(ViewToPaint(camera, image, image, target, target, depth, depth, image))
         painted.append(PaintedView(camera, 0, 0, image, image, rules, depth))
     return views, painted
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from ...compute.threads import at_once, parallel_map
 from ...errors import BadInput
-from ...geometry import EVIDENCE_DEPTH, bounds, cropped, same_surface
+from ...geometry import EVIDENCE_DEPTH, bounds, cropped, dilated, same_surface
 from ...progress import Progress, silent
 from ...solvers.poisson import solve_poisson
 from ...solvers.robust import biweight
+from .detail import ROUND, as_drawn
 from .paper import MappingField, Sampler
 from .warp import Loader, PaintedView, PropagateSettings, Propagation, Reference, Rule, ViewToPaint, warp_reference
 
@@ -41,6 +42,11 @@ SQUARE = np.ones((3, 3), np.uint8)
 def near_hole(target: np.ndarray) -> tuple[slice, slice]:
     """Rows and columns of what is looked at when the target [H, W] bool is painted; empty if that is."""
     return bounds(target, _reach(target))
+
+
+def round_hole(target: np.ndarray, silhouette: np.ndarray) -> np.ndarray:
+    """[H, W] bool: where a view tells how sharply the scene is drawn, of its target and object, [H, W] bool each."""
+    return dilated(target, ROUND) & ~silhouette
 
 
 def _reach(target: np.ndarray) -> int:
@@ -108,6 +114,9 @@ def _painted(
     if sample:
         sample(view, warp, rules)
     raw, blended = warp.colours, base
+    if settings.blend == "band":
+        beside = photo & round_hole(near.target, near.silhouette)
+        raw = as_drawn(raw, painted | photo, near.image, near.drawn, beside)
     if painted.any() and settings.blend == "rim":
         blended = blend_rim(base, raw, painted, (hole & ~painted) | near.silhouette, depth)
     elif painted.any():

@@ -66,6 +66,7 @@ class ViewToPaint:
     target: np.ndarray  # [H, W] bool, T_t
     depth_before: np.ndarray  # [H, W] z with the object
     depth_new: np.ndarray  # [H, W] z of the scene with the new surface; used within `near_hole`
+    drawn: np.ndarray  # [H, W, 3] uint8, what the scene without the object draws; used where `round_hole` says
 
 
 Loader = Callable[[], ViewToPaint]  # brings a view into memory; it is let go again once it is painted
