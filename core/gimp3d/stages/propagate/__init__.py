@@ -33,7 +33,6 @@ HOLD = 1 / 16  # weight that holds a correction at its level where no photo is n
 TOLERANCES = 4.0, 2.0, 1.0  # of a mismatch, round by round
 LOCAL = 2.0  # widths of the band, σ of the neighbourhood that tells what is usual
 CELLS = 4.0  # to a σ, in which it is blurred
-SETTLED = 1e-3  # residual of the blend: a grey level in one of 10,000 pixels
 LEAST_COUNT = 1e-3  # share of a neighbourhood from which on it tells
 FAR = 4  # widths of the band within which photo still tells
 SQUARE = np.ones((3, 3), np.uint8)
@@ -159,7 +158,7 @@ def blend_band(
         weight[data] = 2 / width**2 * nearness * _alike(mismatch, level, data, LOCAL * width)
     anchor = (weight[..., None] * mismatch + hold * level) / (weight + hold)[..., None]
     no, flat = np.zeros_like(domain), np.zeros_like(mismatch)
-    correction = solve_poisson(domain, no, flat, tolerance=SETTLED, weight=weight + hold, anchor=anchor).values
+    correction = solve_poisson(domain, no, flat, weight=weight + hold, anchor=anchor).values
     correction[~domain] = 0
     _continue_over(painted & ~domain, domain, depth, correction)
     result[painted] = to_bytes(raw[painted] + correction[painted])
