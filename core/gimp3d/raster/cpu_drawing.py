@@ -70,13 +70,9 @@ class Drawing:
             raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {chosen.shape}")
         if self.with_colour:
             raise ValueError("footprint: this drawing has colours; make one without")
-        lists, touched = self._made.lists, np.zeros(len(self._made.lists.tiles), bool)
-        _paint(lists.starts, lists.stops, lists.entries, chosen, self._made.features, touched)
-        changed = {
-            "settings": replace(self._made.settings, background=(0.0, 0.0, 0.0)),
-            "wanted": np.where(touched, self._made.wanted, np.uint64(0)),
-        }
-        return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), **changed).rgb[..., 0])
+        _paint(self._made.lists.entries, chosen, self._made.features)
+        black = replace(self._made.settings, background=(0.0, 0.0, 0.0))
+        return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb[..., 0])
 
     def _draw(self, flags: cpu.Flags, **changed: Any) -> Rendering:
         return cpu.blend(replace(self._made, flags=flags, **changed), keep=False)[0]
@@ -90,14 +86,11 @@ def _without(lists: TileLists, gone: np.ndarray) -> TileLists:
 
 
 @exact_kernel
-def _paint(starts, stops, entries, chosen, features, touched):
-    """The listed Gaussians white if they are chosen, else black; and which lists hold any that are."""
-    for slot in range(len(starts)):
-        for k in range(starts[slot], stops[slot]):
-            white = chosen[entries[k]]
-            touched[slot] |= white
-            for channel in range(RED, BLUE + 1):
-                features[entries[k], channel] = 1.0 if white else 0.0
+def _paint(entries, chosen, features):
+    """The listed Gaussians white if they are chosen, else black."""
+    for k in range(len(entries)):
+        for channel in range(RED, BLUE + 1):
+            features[entries[k], channel] = 1.0 if chosen[entries[k]] else 0.0
 
 
 @exact_kernel

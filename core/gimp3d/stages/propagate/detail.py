@@ -39,10 +39,11 @@ def as_drawn(
 
 def _bands(picture: np.ndarray, where: np.ndarray) -> Iterator[np.ndarray]:
     """Differences of a picture's blurs, from fine to coarse; only what is known of it counts."""
-    weight, finer = where.astype(np.float32), np.where(where if picture.ndim == 2 else where[..., None], picture, 0)
-    known = finer
+    each = (..., *[None] * (picture.ndim - 2))  # channel
+    weight, known = where.astype(np.float32), np.where(where[each], picture, 0)
+    finer = known
     for sigma in BLURS:
         share = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), FAINT)
-        coarser = cv2.GaussianBlur(known, (0, 0), sigma) / (share if picture.ndim == 2 else share[..., None])
+        coarser = cv2.GaussianBlur(known, (0, 0), sigma) / share[each]
         yield finer - coarser
         finer = coarser
