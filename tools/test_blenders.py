@@ -17,7 +17,10 @@ from pathlib import Path
 
 from real_blender import ROOT, TOOL, run
 
-SOURCES = ("core", "gimp3d_addon", "tests", "assets", "docs", "tools", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = (
+    *("core", "gimp3d_addon", "tests", "assets", "docs", "tools"),
+    *("pyproject.toml", "constraints.txt", "README.md", "LICENSE"),
+)
 TESTS = ("-m", "pytest", "tests/addon", "-m", "not slow", "--ignore", "tests/addon/test_extension.py")
 OLD, NEW = "4.5.15", "5.2.3"
 

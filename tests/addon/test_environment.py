@@ -119,8 +119,9 @@ def test_the_check_says_whether_it_is_what_was_tested(preferences: SimpleNamespa
     pins = environment.pins(GIMP3D_OT_check.found["python"])
     for name, version in GIMP3D_OT_check.found.items():
         if name != "python":
-            tested = pins[environment.PACKAGES.get(name, name)].startswith(version)
-            assert environment.verdict(name) == ("the tested version" if tested else f"tested with {pins[name]}")
+            pin = pins[environment.PACKAGES.get(name, name)]
+            said = "the tested version" if pin.startswith(version) else f"tested with {pin}"
+            assert environment.verdict(name) == said
     GIMP3D_OT_check.found["scipy"], GIMP3D_OT_check.verified = "0.1", {"numba"}
     assert environment.verdict("scipy").startswith("tested with ") and "SHA-256" in environment.verdict("numba")
 
