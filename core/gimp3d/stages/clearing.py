@@ -42,19 +42,23 @@ class ClearingSettings:
 def object_pixels(
     scene: Gaussians, removed: np.ndarray, views: Sequence[ViewMasks], settings: ClearingSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Where each photo shows the object, and where it may show some of it, [H, W] bool each."""
+    """What each photo shows of some removed Gaussians, [N] bool; see pixels_of."""
     gone = scene.take(removed)
 
     def of(view: ViewMasks) -> tuple[np.ndarray, np.ndarray]:
         window = window_mask(touched_window(gone, view.camera), view.camera)
-        weight = footprint(scene, view.camera, removed, pixels=window)
-        shown, some = (
-            dilated(cv2.morphologyEx((weight > least).astype(np.uint8), cv2.MORPH_OPEN, np.ones((SPECK, SPECK))), RIM)
-            for least in (settings.object_weight, SOME_WEIGHT)
-        )
-        return shown, some
+        return pixels_of(footprint(scene, view.camera, removed, pixels=window), settings)
 
     return parallel_map(of, views)
+
+
+def pixels_of(weight: np.ndarray, settings: ClearingSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Where a photo shows the object, and where it may show some of it, [H, W] bool each, by its blend weight."""
+    shown, some = (
+        dilated(cv2.morphologyEx((weight > least).astype(np.uint8), cv2.MORPH_OPEN, np.ones((SPECK, SPECK))), RIM)
+        for least in (settings.object_weight, SOME_WEIGHT)
+    )
+    return shown, some
 
 
 def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[Laid]) -> np.ndarray:

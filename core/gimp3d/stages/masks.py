@@ -59,7 +59,7 @@ class _Part:
         if view is None:
             raise AttributeError(self.name)  # tells dataclass that the field has no default
         shape, window, values = view.__dict__[self.name]
-        picture = getattr(view, self.base).copy() if self.base else np.zeros(shape, bool)
+        picture = getattr(view, self.base).copy() if self.base else np.zeros(shape, values.dtype)
         picture[window] = values
         return picture
 
@@ -77,6 +77,7 @@ class ViewMasks:
     alpha_before: np.ndarray  # type: ignore[misc]  # float32
     depth_after: _Part = _Part("depth_before")  # float32 z without it
     alpha_after: _Part = _Part("alpha_before")  # float32
+    weight: _Part = _Part()  # uint8, blend weight of the removed Gaussians, 255 is all of it
 
 
 @dataclass(frozen=True)
@@ -229,13 +230,14 @@ def _view_masks(
     shown_after = before.depth.copy(), before.alpha.copy()
     for whole, part in zip(shown_after, scene.surface_depth(gone=removed)):
         whole[window] = part[window]
-    weight = scene.footprint(removed)[window]
+    weight = scene.footprint(removed)  # 0 beyond the window
     silhouette, occluder, target = np.zeros((3, *depth.shape), bool)
-    silhouette[window] = weight > CHANGED
+    silhouette[window] = weight[window] > CHANGED
     if consistent:
-        occluder[window] = in_front(depth[window], weight > MOSTLY_OBJECT)
+        occluder[window] = in_front(depth[window], weight[window] > MOSTLY_OBJECT)
     if mode == "paper":  # beside what is in front T must not outgrow the object
         target = uncovered(gaussians, removed, before) & ~occluder & (silhouette | ~dilated(occluder, 2))
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
-    return ViewMasks(camera, before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after)
+    masks = before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after
+    return ViewMasks(camera, *masks, np.rint(255 * weight).astype(np.uint8))

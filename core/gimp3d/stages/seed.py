@@ -297,7 +297,7 @@ def missing_colours(
     The region is of the rest of the scene; the picture [H, W, 3] uint8 is what should show where `wanted` [H, W] bool.
     """
     drawn, way_back = region.trace(new)
-    missing = np.where(wanted[..., None], picture / 255.0 - drawn.rgb, 0.0)
+    missing = np.where(wanted[..., None], picture / np.float32(255) - drawn.rgb, np.float32(0))
     one = np.broadcast_to(wanted[..., None], missing.shape)
     weights, error = (way_back.backward(PictureGradients(rgb=g.astype(np.float32))).sh[:, 0] for g in (one, missing))
     return weights / SH_C0, error / SH_C0**2

@@ -5,6 +5,7 @@ And one picture of a surface from all photos that show it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -237,17 +238,13 @@ def _mosaic(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """See mosaic; `told` [V, H, W] bool: by which photos."""
     h, w = points.shape[:2]
-    flat = points.reshape(-1, 3)
+    flat = np.ascontiguousarray(points.reshape(-1, 3), np.float64)
 
     def of(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        c = witnesses[k].camera
-        uv, z = c.project(points)
-        x, y = (np.nan_to_num(uv, nan=-1e4).astype(np.float32) - 0.5).transpose(2, 0, 1)
+        (x, y), density = np.empty((2, h, w), np.float32), np.empty(h * w, np.float32)
+        seen_by = pack_camera(witnesses[k].camera), witnesses[k].camera.centre
+        _look_range(0, h * w, flat, normal, *seen_by, told[k].ravel(), x.reshape(-1), y.reshape(-1), density)
         sample = cv2.remap(witnesses[k].photo, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        towards = c.centre - flat
-        cosine = towards @ normal / np.linalg.norm(towards, axis=1)
-        density = np.where(told[k].ravel(), np.maximum(cosine, 0.02) * c.fx * c.fy, 0)
-        density = (density / np.maximum(np.nan_to_num(z.ravel()), 1e-9) ** 2).astype(np.float32)
         return sample.reshape(-1, 3), texture(sample, told[k]).ravel(), density
 
     parts = parallel_map(of, range(len(witnesses)))
@@ -274,23 +271,50 @@ def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
 
 @exact_kernel
+def _look_range(lo, hi, points, normal, c, centre, told, x, y, density):
+    """Where a camera shows points, from pixels' centres, and how many of its pixels fall on a unit of their surface; 0
+    where it is not told."""
+    for i in range(lo, hi):
+        u, v, z = project(c, points[i, 0], points[i, 1], points[i, 2])
+        x[i], y[i], density[i] = max(u, -1e4) - 0.5, max(v, -1e4) - 0.5, 0.0
+        if told[i]:
+            along, square = 0.0, 0.0
+            for k in range(3):
+                towards = centre[k] - points[i, k]
+                along += towards * normal[k]
+                square += towards * towards
+            density[i] = max(along / math.sqrt(square), 0.02) * c[12] * c[13] / max(z, 1e-9) ** 2
+
+
+@exact_kernel
 def _agree_range(lo, hi, samples, textures, density, middle, spread, loud):
-    values = np.empty(len(samples))
+    values, apart = np.empty((2, len(samples)))
     for i in range(lo, hi):
         for channel in range(4):  # the fourth is texture
             count = 0
             for k in range(len(samples)):
                 if density[k, i] > 0:
-                    values[count] = samples[k, i, channel] if channel < 3 else textures[k, i]
+                    _insert(values, count, samples[k, i, channel] if channel < 3 else textures[k, i])
                     count += 1
             if count == 0:
                 break
-            part = np.sort(values[:count])
             if channel < 3:
-                middle[i, channel] = 0.5 * (part[(count - 1) // 2] + part[count // 2])
+                middle[i, channel] = 0.5 * (values[(count - 1) // 2] + values[count // 2])
             else:
-                loud[i] = 0.5 * abs(part[count // 2])
-                spread[i] = 0.5 * np.sort(np.abs(part - part[count // 2]))[count // 2]
+                loud[i] = 0.5 * abs(values[count // 2])
+                for k in range(count):
+                    _insert(apart, k, abs(values[k] - values[count // 2]))
+                spread[i] = 0.5 * apart[count // 2]
+
+
+@inline_kernel
+def _insert(values, count, value):
+    """Keep so many values, and one more, in order."""
+    j = count
+    while j > 0 and values[j - 1] > value:
+        values[j] = values[j - 1]
+        j -= 1
+    values[j] = value
 
 
 @exact_kernel

@@ -25,7 +25,7 @@ from ..progress import Progress
 from ..raster import label_weights
 from ..run import ViewState
 from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
-from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, sunk_rows, with_surface
+from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, pixels_of, sunk_rows, with_surface
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
 from ..stages.masks import Masks, ViewMasks
@@ -60,7 +60,7 @@ class Surfaces:
     planes: tuple[Plane, ...]
     laid: tuple[Laid, ...]  # those of which the object hides something
     selection: Selection  # without what photos show to be surface
-    objects: Sequence[tuple[np.ndarray, np.ndarray]]  # see object_pixels
+    objects: Sequence[tuple[np.ndarray, np.ndarray]]  # see pixels_of
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
     reason: str
@@ -91,11 +91,14 @@ def find_surfaces(
     # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
 
-    def hidden_by(removed: np.ndarray) -> Surfaces:
-        objects = object_pixels(scene, removed, masks.views, settings.clearing)
+    def hidden_by(objects: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surfaces:
         return Surfaces((), (), masks.selection, objects, marked, 1.0, "")
 
-    found, selection = hidden_by(masks.removed), masks.selection
+    def shown(removed: np.ndarray) -> Surfaces:
+        return hidden_by(object_pixels(scene, removed, masks.views, settings.clearing))
+
+    found = hidden_by(parallel_map(lambda v: pixels_of(v.weight / np.float32(255), settings.clearing), masks.views))
+    selection = masks.selection
     witnesses = found.witnesses(views)
     planes = find_planes(witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, witnesses, region, settings.charts)
@@ -104,10 +107,10 @@ def find_surfaces(
     if len(sunk):
         standing = masks.removed
         standing[sunk] = False
-        charts = draw_charts(laid, hidden_by(standing).witnesses(views), region, marked)
+        charts = draw_charts(laid, shown(standing).witnesses(views), region, marked)
         selection = with_surface(masks.selection, scene, sunk, charts)
         reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
-        found = hidden_by(selection.removed)
+        found = shown(selection.removed)
     return replace(found, planes=planes, laid=laid, selection=selection, reason=reason)
 
 

@@ -61,7 +61,7 @@ def removal(extra: Gaussians | None = None) -> Removal:
     for camera in EYES:
         depth, alpha = surface_depth(whole, camera)
         no = np.zeros(depth.shape, bool)
-        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha))
+        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha, no))
     selection = Selection(fates)
     masks = object_pixels(whole, selection.removed, views, ClearingSettings())
     grey, witnesses = np.full(3, 99, np.uint8), []
@@ -218,7 +218,10 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     ring = (np.abs(plain.scene.means[:, :2]).max(1) < OFF) & (plain.scene.means[:, 2] < 0.01)
     whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
     taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
-    masks = Masks(Selection(taken), tuple(plain.views), "need", 1.0, "")
+    gone = taken >= Fate.REMOVED_INSIDE
+    weights = [np.rint(255 * footprint(whole, v.camera, gone)).astype(np.uint8) for v in plain.views]
+    seen = tuple(replace(v, weight=w) for v, w in zip(plain.views, weights))
+    masks = Masks(Selection(taken), seen, "need", 1.0, "")
     photos = [render_bytes(whole, v.camera) for v in plain.views]
     levelled = Exposure(np.ones(3))
     views = [ViewState.first(v, photo, levelled) for v, photo in zip(plain.views, photos)]

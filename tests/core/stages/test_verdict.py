@@ -64,7 +64,7 @@ def case(whole: Gaussians) -> Case:
         photos[camera.id] = np.clip(render_bytes(whole, camera) + noise, 0, 255).astype(np.uint8)
         depth, alpha = surface_depth(whole, camera)
         no = np.zeros(depth.shape, bool)
-        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha))
+        views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha, no))
     selection = Selection(np.where(removed, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
     pixels = object_pixels(whole, removed, views, ClearingSettings())
     witnesses = [

@@ -149,6 +149,8 @@ def blend_band(
     near = distance <= FAR * width
     whole = near & (painted | band | (depth > 0))  # the correction passes what lies between
     domain = whole & ~_behind_seams(painted | band, depth)
+    _, parts = cv2.connectedComponents(domain.astype(np.uint8), connectivity=4)
+    domain &= np.isin(parts, parts[domain & dilated(painted, 1)])  # no other part has a say
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
     level = _levels(domain, data, mismatch)
