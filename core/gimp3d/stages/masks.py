@@ -77,7 +77,7 @@ class ViewMasks:
     alpha_before: np.ndarray  # type: ignore[misc]  # float32
     depth_after: _Part = _Part("depth_before")  # float32 z without it
     alpha_after: _Part = _Part("alpha_before")  # float32
-    weight: _Part = _Part()  # uint8, blend weight of the removed Gaussians, 255 is all of it
+    weight: _Part = _Part()  # float32, blend weight of the removed Gaussians
 
 
 @dataclass(frozen=True)
@@ -239,5 +239,4 @@ def _view_masks(
         target = uncovered(gaussians, removed, before) & ~occluder & (silhouette | ~dilated(occluder, 2))
     if before.extra is not None:
         target, silhouette, depth = target | before.extra, silhouette | before.extra, np.where(before.extra, 0, depth)
-    masks = before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after
-    return ViewMasks(camera, *masks, np.rint(255 * weight).astype(np.uint8))
+    return ViewMasks(camera, before.polygon, silhouette, occluder, target, depth, before.alpha, *shown_after, weight)

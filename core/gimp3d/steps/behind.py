@@ -97,7 +97,7 @@ def find_surfaces(
     def shown(removed: np.ndarray) -> Surfaces:
         return hidden_by(object_pixels(scene, removed, masks.views, settings.clearing))
 
-    found = hidden_by(parallel_map(lambda v: pixels_of(v.weight / np.float32(255), settings.clearing), masks.views))
+    found = hidden_by(parallel_map(lambda v: pixels_of(v.weight, settings.clearing), masks.views))
     selection = masks.selection
     witnesses = found.witnesses(views)
     planes = find_planes(witnesses, region, settings.charts, settled)

@@ -219,8 +219,7 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
     taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
     gone = taken >= Fate.REMOVED_INSIDE
-    weights = [np.rint(255 * footprint(whole, v.camera, gone)).astype(np.uint8) for v in plain.views]
-    seen = tuple(replace(v, weight=w) for v, w in zip(plain.views, weights))
+    seen = tuple(replace(v, weight=footprint(whole, v.camera, gone)) for v in plain.views)
     masks = Masks(Selection(taken), seen, "need", 1.0, "")
     photos = [render_bytes(whole, v.camera) for v in plain.views]
     levelled = Exposure(np.ones(3))

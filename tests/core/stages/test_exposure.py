@@ -23,7 +23,7 @@ def view() -> ViewMasks:
         np.ones(SHAPE, np.float32),
         depth,
         np.ones(SHAPE, np.float32),
-        silhouette.astype(np.uint8),
+        silhouette.astype(np.float32),
     )
 
 

@@ -348,9 +348,9 @@ def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: 
     bits = rng.random((4, height, width)) < 0.3
     before = rng.random((2, height, width), np.float32)
     after = np.where(rng.random((2, height, width)) < 0.1, rng.random((2, height, width)), before).astype(np.float32)
-    weight = np.where(bits[1], rng.integers(0, 256, (height, width)), 0).astype(np.uint8)
+    weight = np.where(bits[1], rng.random((height, width)), 0).astype(np.float32)
     view = ViewMasks(cameras()[0], *bits, *before, *after, weight)
-    assert view.weight.dtype == np.uint8 and (view.weight == weight).all()
+    assert view.weight.dtype == np.float32 and (view.weight == weight).all()
     for name, expected in zip(("polygon", "silhouette", "occluder", "target"), bits):
         found = getattr(view, name)
         assert found.dtype == bool and (found == expected).all()
