@@ -300,7 +300,7 @@ def lay_surface(
         return level
     completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
     relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
-    # splats are drawn a little behind the surface that they show: new ones must lie where they do
+    # near splats cover far ones, so all seem to stand higher: trained ones lie as much lower, and so must new ones
     near = offset[known & (np.abs(offset) < SINKS * diagonal)]
     sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
     return replace(
