@@ -156,7 +156,7 @@ def _settled(
     """The motion near a guess that explains most, if that is enough; it turns about the hole."""
     angle, mirrored, shift = guess
     ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (known & dilated(hole, RIM), 4000)))
-    shows = known.astype(np.float32)
+    shows, of_ring, of_rim = known.astype(np.float32), _variance(image, ring), _variance(image, rim)
     middle = np.argwhere(hole).mean(0)
     target = turn_of(angle, mirrored) @ middle + shift
 
@@ -164,23 +164,25 @@ def _settled(
         turn = turn_of(angle + values[0], mirrored)
         return turn, target + values[1:] - turn @ middle
 
-    def explained(values: np.ndarray, of: Places = ring, overlap: float = OVERLAP) -> tuple[float, np.ndarray]:
-        """Share of the variance of the pixels, and the values; so many of them must be mapped to something known."""
+    def explained(
+        values: np.ndarray, of: Places = ring, variance: float = of_ring, overlap: float = OVERLAP
+    ) -> tuple[float, np.ndarray]:
+        """Share of the pixels' variance, and the values; so many of them must be mapped to something known."""
         rows, cols = of
         y, x = _mapped(*at(values), rows, cols)
         both = _sample(shows, y, x) > 0.999
         if both.sum() < max(1, overlap * len(rows)):
             return -np.inf, values
         rest = ((_sample(image, y[both], x[both]) - image[rows[both], cols[both]]) ** 2).sum(-1).mean()
-        return 1 - float(rest) / (2 * max(_variance(image, of), PLAIN)), values
+        return 1 - float(rest) / (2 * max(variance, PLAIN)), values
 
     best, values = pattern_search(explained, np.eye(3)[0 if angle or mirrored else 1 :])
     y, x = _mapped(*at(values), *inside)
     tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
     # where something ends at the hole, only its rim contradicts; where it is plain, something far off is explained
-    if not tells or min(best, explained(values, rim, 0)[0]) < EXPLAINED:
+    if not tells or min(best, explained(values, rim, of_rim, 0)[0]) < EXPLAINED:
         return None
-    return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * _variance(image, ring) / 3))
+    return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * of_ring / 3))
 
 
 def pattern_search(at: Callable[[np.ndarray], tuple[float, Any]], axes: np.ndarray) -> tuple[float, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -189,17 +190,27 @@ class _View:
 
     def _ssim(self, rgb: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The SSIM map [h, w, 3] (Wang 2004), and the gradient of Σ share · SSIM with respect to rgb."""
-        mean, square, product = _blurred(rgb), _blurred(rgb * rgb), _blurred(rgb * self.image)
-        brightness = mean**2 + self.mean**2 + STEADY
-        contrast = square - mean**2 + self.variance + STEADIER
-        alike, together = 2 * mean * self.mean + STEADY, 2 * (product - mean * self.mean) + STEADIER
+        ends = 0, len(rgb) // 2, len(rgb)
+        parts = parallel_map(lambda rows: self._ssim_of(rgb, share, *rows), itertools.pairwise(ends))
+        ssim, slope = (np.concatenate(part) for part in zip(*parts))
+        return ssim, slope
+
+    def _ssim_of(self, rgb: np.ndarray, share: np.ndarray, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+        """The same of some rows."""
+        near = slice(max(0, low - WINDOW), high + WINDOW)  # what two blurs reach
+        inner = slice(low - near.start, high - near.start)
+        rgb, share, image, image_mean, variance = (a[near] for a in (rgb, share, self.image, self.mean, self.variance))
+        mean, square, product = _blurred(rgb), _blurred(rgb * rgb), _blurred(rgb * image)
+        brightness = mean**2 + image_mean**2 + STEADY
+        contrast = square - mean**2 + variance + STEADIER
+        alike, together = 2 * mean * image_mean + STEADY, 2 * (product - mean * image_mean) + STEADIER
         ssim = alike * together / (brightness * contrast)
         by_product = 2 * share * alike / (brightness * contrast)
         by_square = -share * ssim / contrast
-        by_mean = 2 * share * (self.mean * (together - alike) / (brightness * contrast) - ssim * mean / brightness)
+        by_mean = 2 * share * (image_mean * (together - alike) / (brightness * contrast) - ssim * mean / brightness)
         by_mean -= 2 * mean * by_square
-        slope = _blurred(by_mean) + 2 * rgb * _blurred(by_square) + self.image * _blurred(by_product)
-        return ssim, slope
+        slope = _blurred(by_mean) + 2 * rgb * _blurred(by_square) + image * _blurred(by_product)
+        return ssim[inner], slope[inner]
 
 
 def _blurred(picture: np.ndarray) -> np.ndarray:
