@@ -4,6 +4,6 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, before NumPy is imported
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in the command, before NumPy is imported
 _TESTS = Path(__file__).resolve().parents[1] / "tests"
 sys.path[:0] = [str(_TESTS), str(_TESTS / "core" / "raster")]  # made scenes whose truth is known; torch's rasteriser

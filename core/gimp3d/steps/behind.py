@@ -91,14 +91,12 @@ def find_surfaces(
     # What the user named beside the object, by a mask or a box of its own: masks let no depth stand there.
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
 
-    def hidden_by(objects: Sequence[tuple[np.ndarray, np.ndarray]]) -> Surfaces:
-        return Surfaces((), (), masks.selection, objects, marked, 1.0, "")
+    objects, selection = parallel_map(lambda v: pixels_of(v.weight, settings.clearing), masks.views), masks.selection
+    found = Surfaces((), (), selection, objects, marked, 1.0, "")
 
-    def shown(removed: np.ndarray) -> Surfaces:
-        return hidden_by(object_pixels(scene, removed, masks.views, settings.clearing))
+    def without(removed: np.ndarray) -> Surfaces:
+        return replace(found, objects=object_pixels(scene, removed, masks.views, settings.clearing))
 
-    found = hidden_by(parallel_map(lambda v: pixels_of(v.weight, settings.clearing), masks.views))
-    selection = masks.selection
     witnesses = found.witnesses(views)
     planes = find_planes(witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, witnesses, region, settings.charts)
@@ -107,10 +105,10 @@ def find_surfaces(
     if len(sunk):
         standing = masks.removed
         standing[sunk] = False
-        charts = draw_charts(laid, shown(standing).witnesses(views), region, marked)
+        charts = draw_charts(laid, without(standing).witnesses(views), region, marked)
         selection = with_surface(masks.selection, scene, sunk, charts)
         reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
-        found = shown(selection.removed)
+        found = without(selection.removed)
     return replace(found, planes=planes, laid=laid, selection=selection, reason=reason)
 
 

@@ -433,6 +433,20 @@ def test_the_blend_corrects_each_side_of_a_depth_seam_by_its_own_photo() -> None
     assert np.abs(flat[painted].astype(int) - base[painted]).max() > 5
 
 
+def test_what_the_fill_does_not_touch_has_no_say() -> None:
+    """Specks of photo between seams: a maze of them would make the solution slow, and worse where it counts."""
+    rng = np.random.default_rng(0)
+    base, raw = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8), rng.uniform(0, 255, (60, 80, 3)).astype(np.float32)
+    painted, band = np.zeros((2, 60, 80), bool)
+    painted[20:40, 20:40] = True
+    band[15:45, 15:45] = ~painted[15:45, 15:45]
+    alone = blend_band(base, raw, painted, band, 6.0, np.where(painted | band, 1.0, 0.0))
+    specks = np.zeros_like(band)
+    specks[:, 50::2] = rng.random((60, 15)) < 0.7
+    depth = np.where(painted | band | specks, 1.0, 0.0)
+    assert (blend_band(base, raw, painted, band | specks, 6.0, depth) == alone).all()
+
+
 def test_a_part_without_photo_keeps_its_colours() -> None:
     base, depth, painted = seam()
     raw = np.full((*painted.shape, 3), 60.0, np.float32)

@@ -148,12 +148,13 @@ def blend_band(
     distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5)
     near = distance <= FAR * width
     whole = near & (painted | band | (depth > 0))  # the correction passes what lies between
-    domain = whole & ~_behind_seams(painted | band, depth)
-    _, parts = cv2.connectedComponents(domain.astype(np.uint8), connectivity=4)
-    domain &= np.isin(parts, parts[domain & dilated(painted, 1)])  # no other part has a say
+    joined = whole & ~_behind_seams(painted | band, depth)
+    _, parts = cv2.connectedComponents(joined.astype(np.uint8), connectivity=4)
+    parts[~np.isin(parts, parts[dilated(painted, 1)])] = 0  # what the fill does not touch has no say
+    domain = parts > 0
     data = band & domain
     mismatch = np.where(data[..., None], base - raw, 0)
-    level = _levels(domain, data, mismatch)
+    level = _levels(parts, data, mismatch)
     weight, hold = np.zeros(data.shape), (HOLD / width) ** 2
     if data.any():  # where the two show different things, the difference is none of light
         nearness = 1 / (1 + (distance[data] / width) ** 2)
@@ -204,10 +205,9 @@ def _alike(mismatch: np.ndarray, level: np.ndarray, data: np.ndarray, width: flo
     return counts[data]
 
 
-def _levels(domain: np.ndarray, data: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """[H, W, 3]: the median of each connected part's data, where there are enough of them; else 0."""
+def _levels(parts: np.ndarray, data: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """[H, W, 3]: the median of each part's data, where there are enough of them; else 0. `parts` [H, W] are numbers."""
     level = np.zeros(values.shape)
-    _, parts = cv2.connectedComponents(domain.astype(np.uint8), connectivity=4)
     found, counts = np.unique(parts[data], return_counts=True)
     for part in found[counts >= LEAST_BAND]:
         inside = parts == part
