@@ -20,7 +20,7 @@ from ...geometry import dilated, framed, sees
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
-from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_size
+from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_density, pixel_size
 from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
 from .plane import Hits as Hits
@@ -39,6 +39,7 @@ SAMPLES = 128  # colours of each kind, squared, that the models of both are made
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
+MOST_TRIMMED = 0.2  # share of the pixels that the object hides, on each of four sides, without which a chart may be
 MARGIN, LEAST_MARGIN = 0.75, 0.15  # of a hole's size, and diagonals: surface round it to fill it from
 SURFACE = 5000  # points of a chart at which drawn depths are compared
 SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
@@ -136,22 +137,42 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
 def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float) -> Surface | None:
     """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
 
-    None if the object hides nothing of it, or no view faces what it hides.
+    None if the object hides nothing of it, or no view faces what it hides. What few pixels of the views look at, such
+    as a plane's far end, is left out rather than to show the rest with less detail than photos.
     """
     diagonal = extent(region)
     x, y = grid(2 * diagonal, PLACES)
-    hole = _unseen(ask(witnesses, plane.points(x, y).reshape(-1, 3), TOLERANCE).reshape(-1, *x.shape))
+    places = plane.points(x, y).reshape(-1, 3)
+    said = ask(witnesses, places, TOLERANCE)
+    hole = _unseen(said.reshape(-1, *x.shape))
     labels, _ = scipy.ndimage.label(hole)
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
         return None
     there, cell = np.array([x[hole], y[hole]]), 4 * diagonal / PLACES
-    low, high = there.min(1) - cell, there.max(1) + cell
-    size = high - low
-    size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
-    place = plane.points(*((low + high) / 2)[:, None])[0]
-    texel = pixel_size(place, plane.normal, witnesses)
-    return flat_surface(plane, place, size, max(texel, float(size.max()) / largest)) if texel < math.inf else None
+    pixels = np.zeros(there.shape[1])  # that the object hides
+    for witness, hidden in zip(witnesses, said[:, hole.ravel()] == Says.HIDDEN):
+        pixels += np.where(hidden, pixel_density(places[hole.ravel()], plane.normal, witness.camera), 0)
+    best, found = 0.0, None
+    for trimmed in np.linspace(0, MOST_TRIMMED, 2 * PLACES // 10 + 1):
+        low, high = (_quantiles(there, pixels, q) for q in (trimmed, 1 - trimmed))
+        shown = pixels[((low <= there.T) & (there.T <= high)).all(1)].sum()
+        size = high - low + 2 * cell
+        size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
+        place = plane.points(*((low + high) / 2)[:, None])[0]
+        pixel = pixel_size(place, plane.normal, witnesses)
+        texel = max(pixel, float(size.max()) / largest)
+        if pixel < math.inf and shown * (pixel / texel) ** 2 > best:
+            best, found = shown * (pixel / texel) ** 2, (place, size, texel)
+    return flat_surface(plane, *found) if found else None
+
+
+def _quantiles(there: np.ndarray, weight: np.ndarray, share: float) -> np.ndarray:
+    """[2]: x and y of places [2, N] below which a share of the weight [N] lies."""
+    order = np.argsort(there, axis=1)
+    below = np.cumsum(weight[order], axis=1) / max(weight.sum(), 1e-300)
+    k = np.minimum((below < share).sum(1), there.shape[1] - 1)
+    return np.take_along_axis(there, np.take_along_axis(order, k[:, None], 1), 1)[:, 0]
 
 
 def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:

@@ -268,15 +268,19 @@ def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float
     return Surface(plane, camera, np.full((height, width), away, np.float32))
 
 
+def pixel_density(points: np.ndarray, normal: np.ndarray, camera: Camera) -> np.ndarray:
+    """[N]: pixels of a view on a unit of surface at points [N, 3]; 0 where it does not face the view."""
+    z, towards = camera.project(points)[1], camera.centre - points
+    cosine = (towards @ normal) / np.linalg.norm(towards, axis=1)
+    facing = (z > 0) & (cosine > 0)
+    return np.where(facing, camera.fx * camera.fy * cosine / np.where(facing, z, 1) ** 2, 0)
+
+
 def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[Witness]) -> float:
     """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
-    density = []
-    for camera in (v.camera for v in views):
-        z, towards = camera.project(place[None])[1][0], camera.centre - place
-        cosine = float((towards @ normal) / np.linalg.norm(towards))
-        if z > 0 and cosine > 0:
-            density.append(camera.fx * camera.fy * cosine / z**2)
-    return 1 / math.sqrt(float(np.percentile(density, 90))) if density else math.inf
+    density = np.array([pixel_density(place[None], normal, v.camera)[0] for v in views])
+    facing = density[density > 0]
+    return 1 / math.sqrt(float(np.percentile(facing, 90))) if len(facing) else math.inf
 
 
 def lay_surface(
