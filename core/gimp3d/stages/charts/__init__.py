@@ -305,15 +305,21 @@ def _scatter(surface: np.ndarray, others: Sequence[Plane], witnesses: Sequence[W
 
 def _unseen(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
-    seen = np.isin(said, (Says.SEEN, Says.BESIDE, Says.THROUGH)).sum(0)
+    seen = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0) | (_through(said) > 0)
     hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
-    return (seen == 0) & (hidden > behind)
+    return ~seen & (hidden > behind)
+
+
+def _through(said: np.ndarray) -> np.ndarray:
+    """[H, W] in how many photos something behind it is seen: not one alone, whose mask may have a gap."""
+    count = (said == Says.THROUGH).sum(0)
+    return np.where(count > 1, count, 0)
 
 
 def shown_there(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: where the surface is: photos show it there rather than what lies behind it, or do so round it."""
     seen = (said == Says.SEEN).sum(0) + (said == Says.BESIDE).sum(0)
-    through = (said == Says.THROUGH).sum(0)
+    through = _through(said)
     known = seen + through > 0
     if not known.any():
         return np.ones(known.shape, bool)
