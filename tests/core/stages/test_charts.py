@@ -585,3 +585,39 @@ def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:
     edge[:, :, 40:][edge[:, :, 40:] == Says.SEEN] = Says.THROUGH
     there = stage.shown_there(edge)
     assert there[20:40, 30:37].all() and not there[20:40, 44:].any()
+
+
+def test_a_far_end_that_one_view_looks_at_costs_the_rest_no_detail() -> None:
+    """Close views do not frame the floor's far end, which the block hides in a low one."""
+    close = tuple(replace(c, fx=3.5 * c.fx, fy=3.5 * c.fy) for c in EYES)
+    pose = look_at(np.array([0, -1.2, 0.4]), np.array([0, 0, 0.3]), UP)
+    low = Camera("low", 240, 180, 120.0, 120.0, 120.0, 90.0, pose)
+    plane, settings = Plane.make(np.zeros(3), UP, REGION), ChartSettings(largest=300)
+    (alone,) = charts_of([plane], room(close, [FLOOR]).witnesses, settings)
+    (chart,) = charts_of([plane], room((*close, low), [FLOOR]).witnesses, settings)
+    size, alones = (np.linalg.norm(texels(c)[1] - texels(c)[0]) for c in (chart, alone))
+    assert size < 1.1 * alones
+    (whole,) = charts_of([plane], room((*close, low), [FLOOR]).witnesses, ChartSettings(largest=10_000))
+    assert np.ptp(texels(whole)[:, 1]) > 2 * np.ptp(texels(chart)[:, 1])  # where it costs nothing, it is shown
+
+
+def test_one_photo_alone_does_not_tell_that_the_surface_ends(floor_room: Room, floor_chart: Chart) -> None:
+    """A gap in one photo's mask, behind which rough splats lie, is no hole in the floor that the object hides."""
+    plane = Plane.make(np.zeros(3), UP, REGION)
+    points = texels(floor_chart)[floor_chart.hole.ravel()]
+    middle = points[np.linalg.norm(points - points.mean(0), axis=1) < 0.1]
+
+    def with_gap(witness: Witness) -> Witness:
+        gap = sees(witness.camera, np.ones(witness.depth.shape, np.float32), middle, np.inf)
+        uv, _ = witness.camera.project(middle[gap])
+        rows, cols = np.floor(uv[:, ::-1]).astype(int).T
+        hidden, depth = witness.hidden.copy(), witness.depth.copy()
+        hidden[rows, cols], depth[rows, cols] = False, 20.0
+        return replace(witness, hidden=hidden, depth=depth)
+
+    first, second, *others = floor_room.witnesses
+    (one,) = charts_of([plane], [with_gap(first), second, *others])
+    (two,) = charts_of([plane], [with_gap(first), with_gap(second), *others])
+    there = sees(one.camera, one.there.astype(np.float32), middle, np.inf)
+    assert there.all() and sees(one.camera, one.hole.astype(np.float32), middle, np.inf).all()
+    assert not sees(two.camera, two.there.astype(np.float32), middle, np.inf).any()

@@ -39,7 +39,7 @@ SAMPLES = 128  # colours of each kind, squared, that the models of both are made
 SOFT = 8  # texels round a hole that may show some of the object
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
-MOST_TRIMMED = 0.2  # share of the pixels that the object hides, on each of four sides, without which a chart may be
+TRIMMED = np.linspace(0, 0.2, 21)  # shares of the hidden pixels, on each side, without which a chart is tried
 MARGIN, LEAST_MARGIN = 0.75, 0.15  # of a hole's size, and diagonals: surface round it to fill it from
 SURFACE = 5000  # points of a chart at which drawn depths are compared
 SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
@@ -154,7 +154,7 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
     for witness, hidden in zip(witnesses, said[:, hole.ravel()] == Says.HIDDEN):
         pixels += np.where(hidden, pixel_density(places[hole.ravel()], plane.normal, witness.camera), 0)
     best, found = 0.0, None
-    for trimmed in np.linspace(0, MOST_TRIMMED, 2 * PLACES // 10 + 1):
+    for trimmed in TRIMMED:
         low, high = (_quantiles(there, pixels, q) for q in (trimmed, 1 - trimmed))
         shown = pixels[((low <= there.T) & (there.T <= high)).all(1)].sum()
         size = high - low + 2 * cell
@@ -162,8 +162,8 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
         place = plane.points(*((low + high) / 2)[:, None])[0]
         pixel = pixel_size(place, plane.normal, witnesses)
         texel = max(pixel, float(size.max()) / largest)
-        if pixel < math.inf and shown * (pixel / texel) ** 2 > best:
-            best, found = shown * (pixel / texel) ** 2, (place, size, texel)
+        if pixel < math.inf and shown * pixel / texel > best:
+            best, found = shown * pixel / texel, (place, size, texel)
     return flat_surface(plane, *found) if found else None
 
 
