@@ -23,6 +23,7 @@ from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.exemplar import EDGE
+from gimp3d.stages.witness import Says
 
 from .command import kept, parser_of, say, told_in_one_line, write
 from .scenes import BUILT_IN, GIVEN, MADE, MASKS, REAL, Scene, filled, mean_psnrs, new_gaussians, read_scenes, removal
@@ -85,6 +86,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
+    "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
+    "one photo tells that the surface ends": (
+        ("gimp3d.stages.charts:_through", lambda said: (said == Says.THROUGH).sum(0)),
+    ),
     "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
     # what stays round it
     "what stays learns nothing": (("gimp3d.steps.behind:SHOWN", math.inf),),

@@ -156,7 +156,7 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
     best, found = 0.0, None
     for trimmed in TRIMMED:
         low, high = (_quantiles(there, pixels, q) for q in (trimmed, 1 - trimmed))
-        shown = pixels[((low <= there.T) & (there.T <= high)).all(1)].sum()
+        shown = pixels[((there.T >= low) & (there.T <= high)).all(1)].sum()
         size = high - low + 2 * cell
         size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
         place = plane.points(*((low + high) / 2)[:, None])[0]
