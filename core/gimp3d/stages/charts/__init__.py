@@ -149,14 +149,14 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
         return None
-    there, cell = np.array([x[hole], y[hole]]), 4 * diagonal / PLACES
-    pixels = np.zeros(there.shape[1])  # that the object hides
+    there, cell = np.stack([x[hole], y[hole]], 1), 4 * diagonal / PLACES
+    pixels = np.zeros(len(there))  # that the object hides
     for witness, hidden in zip(witnesses, said[:, hole.ravel()] == Says.HIDDEN):
         pixels += np.where(hidden, pixel_density(places[hole.ravel()], plane.normal, witness.camera), 0)
     best, found = 0.0, None
     for trimmed in TRIMMED:
         low, high = (_quantiles(there, pixels, q) for q in (trimmed, 1 - trimmed))
-        shown = pixels[((there.T >= low) & (there.T <= high)).all(1)].sum()
+        shown = pixels[((there >= low) & (there <= high)).all(1)].sum()
         size = high - low + 2 * cell
         size = np.minimum(size + 2 * np.maximum(MARGIN * size.max(), LEAST_MARGIN * diagonal), 4 * diagonal)
         place = plane.points(*((low + high) / 2)[:, None])[0]
@@ -168,11 +168,11 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
 
 
 def _quantiles(there: np.ndarray, weight: np.ndarray, share: float) -> np.ndarray:
-    """[2]: x and y of places [2, N] below which a share of the weight [N] lies."""
-    order = np.argsort(there, axis=1)
-    below = np.cumsum(weight[order], axis=1) / max(weight.sum(), 1e-300)
-    k = np.minimum((below < share).sum(1), there.shape[1] - 1)
-    return np.take_along_axis(there, np.take_along_axis(order, k[:, None], 1), 1)[:, 0]
+    """[2]: x and y of places [N, 2] below which a share of the weight [N] lies."""
+    order = np.argsort(there, axis=0)
+    below = np.cumsum(weight[order], axis=0) < share * weight.sum()
+    k = np.minimum(below.sum(0), len(there) - 1)
+    return there[order[k, [0, 1]], [0, 1]]
 
 
 def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
