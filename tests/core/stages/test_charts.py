@@ -403,6 +403,30 @@ def test_parallel_surfaces_do_not_end_each_other(floor_room: Room, floor_chart: 
     np.testing.assert_array_equal(first.there, floor_chart.there)
 
 
+def test_a_mat_is_where_photos_agree_on_it_and_the_floor_elsewhere(floor_room: Room) -> None:
+    """Rough depths do not tell a mat from the floor, but photos do; what the object hides is as what is round it."""
+    high, edge = 0.03, 0.05
+    raised = room(EYES, [(FLOOR[0], high)])
+
+    def merged(low: Witness, mat: Witness) -> Witness:
+        rays = low.camera.unproject(low.camera.pixel_centres(), np.ones(low.depth.shape)) - low.camera.centre
+        on_mat = ((low.camera.centre + mat.depth[..., None] * rays)[..., 0] > edge) & ~low.hidden
+        photo = np.where(on_mat[..., None], mat.photo, low.photo)
+        return replace(low, photo=photo, depth=np.where(on_mat, mat.depth, low.depth))
+
+    seen = [merged(*pair) for pair in zip(floor_room.witnesses, raised.witnesses)]
+    planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, high)]
+    alone = [charts_of([plane], seen, ChartSettings(relief=0.0))[0] for plane in planes]
+    assert all(chart.there.all() for chart in alone)  # by depths
+    for chart, lone, side in zip(charts_of(planes, seen, ChartSettings(relief=0.0)), alone, (-1, 1)):
+        beyond = (side * (texels(chart)[:, 0] - edge)).reshape(chart.there.shape)
+        told = (chart.photos > 1) | lone.hole
+        assert chart.there[told & (beyond > 0.1)].mean() > 0.97
+        assert chart.there[told & (beyond < -0.1)].mean() < 0.03
+        assert not (chart.hole & ~chart.there).any()
+        assert chart.hole[beyond > 0.1].sum() > 100
+
+
 def test_the_extent_of_several_boxes_holds_them_all() -> None:
     one, two = Box.make([0, 0, 0], [1, 2, 2]), Box.make([10, 0, 0], [1, 1, 1])
     assert extent((one,)) == pytest.approx(3)
@@ -537,7 +561,7 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     known[disputed] = False
     colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
     image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
-    shown = stage._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no)
+    shown = stage._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no, np.zeros(no.shape))
     _, rests, foreign = stage._told_by_colours(shown, image[hole], no, no)
     assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
     assert foreign[disputed].all() and not foreign[known].any()
@@ -566,7 +590,8 @@ def test_mixed_pixels_beside_the_object_are_unlike_all_of_the_surface_near_by(gr
 
     def mixed(photos: int, hiding: int) -> np.ndarray:
         shown, hidden = (np.where(hole, 0, n).astype(np.uint16) for n in (photos, hiding))
-        return stage._mixed(stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, ~no), hole, beside)
+        described = stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, ~no, np.zeros(no.shape))
+        return stage._mixed(described, hole, beside)
 
     found = mixed(2, 5)
     assert found[dashes].all() and not found[spot].any() if grain == 1 else found[dashes].mean() < 0.2

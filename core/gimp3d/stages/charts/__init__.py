@@ -37,6 +37,10 @@ GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
 SAMPLES = 128  # colours of each kind, squared, that the models of both are made of
 SOFT = 8  # texels round a hole that may show some of the object
+ALONG = (
+    16.0  # texels, σ of the neighbourhood that says which of two close surfaces is there; textures take half of that
+)
+CLEARLY = 0.9  # share of what photos differ by on one surface, below which the other one is there
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
 TRIMMED = np.linspace(0, 0.2, 21)  # shares of the hidden pixels, on each side, without which a chart is tried
@@ -78,7 +82,7 @@ def draw_charts(
     """What photos show of the surfaces at the planes; those without a hole are left out. Pixels of the witnesses' views
     that are `marked`, [H, W] bool each, are to be filled whatever they show.
     """
-    charts = [_chart(one, region, witnesses, marked) for one in laid]
+    charts = _parted([_chart(one, region, witnesses, marked) for one in laid], witnesses)
     bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
     return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
 
@@ -95,6 +99,49 @@ def _bounded(chart: Chart, charts: Sequence[Chart]) -> Chart:
     return replace(chart, there=there, hole=chart.hole & there)
 
 
+def _parted(drawn: Sequence[tuple[Chart, np.ndarray]], witnesses: Sequence[Witness]) -> list[Chart]:
+    """Charts that lie too close to each other for rough depths to tell which is drawn, such as a wall and a picture on
+    it, each where photos agree on it; with every chart, see _chart, by how much they differ.
+
+    The first is there, but where photos' textures differ clearly less on another.
+    """
+    there = [chart.there for chart, _ in drawn]
+    for k, (later, spread) in enumerate(drawn):
+        for j, (first, spread_on_first) in enumerate(drawn[:k]):
+            if later.plane.crosses(first.plane):
+                continue
+            points = later.points()
+            away = np.median([np.linalg.norm(w.camera.centre - later.plane.origin) for w in witnesses])
+            gap = np.abs((points - first.plane.origin) @ first.plane.normal)
+            disputed = gap < max(first.tolerance, later.tolerance) * away
+            (rows, cols), inside = _texels_at(first, points)
+            others = np.where(inside, spread_on_first[rows, cols], np.nan)
+            better = _agree_better(spread, others, disputed)
+            there[k] = there[k] & (better | ~disputed)
+            (rows, cols), inside = _texels_at(later, first.points())
+            there[j] = there[j] & ~(inside & (better & disputed)[rows, cols])
+    return [replace(c, there=t, known=c.known & t, hole=c.hole & t) for (c, _), t in zip(drawn, there)]
+
+
+def _texels_at(chart: Chart, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns, [2, H, W], of a chart over or under which points [H, W, 3] lie, and [H, W] bool, where any."""
+    index, rows, cols, _ = framed(chart.camera, points.reshape(-1, 3))
+    found, inside = np.zeros((2, points[..., 0].size), int), np.zeros(points[..., 0].size, bool)
+    found[:, index], inside[index] = (rows, cols), True
+    return found.reshape(2, *points.shape[:2]), inside.reshape(points.shape[:2])
+
+
+def _agree_better(spread: np.ndarray, others: np.ndarray, disputed: np.ndarray) -> np.ndarray:
+    """[H, W] bool: where photos' textures differ clearly less than on the other surface, see _Shown.spread; what no
+    photos tell is as what is round it."""
+    told = disputed & np.isfinite(spread) & np.isfinite(others)
+    if not told.any():
+        return told
+    own, other = (cv2.GaussianBlur(np.where(told, s, 0).astype(np.float32), (0, 0), ALONG) for s in (spread, others))
+    votes = np.sign(CLEARLY * other - own)
+    return carried(votes[..., None].repeat(3, -1), told)[..., 0] > 0
+
+
 @dataclass(frozen=True)
 class _Shown:
     """What photos show of a surface, as far as the object's masks tell; arrays [H, W]."""
@@ -107,9 +154,13 @@ class _Shown:
     alike: np.ndarray  # bool, known without allowing for misplaced texture
     hole: np.ndarray  # bool
     alike_below: np.ndarray  # bool, below the masks they have a texture in common, and differ no more than elsewhere
+    spread: np.ndarray  # float32, grey levels by which photos' textures differ; NaN where fewer than two show it
 
 
-def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> Chart:
+def _chart(
+    laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]
+) -> tuple[Chart, np.ndarray]:
+    """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
     points, shape = laid.points(), laid.depth.shape
     texels = points.reshape(-1, 3)
     scatter = _scatter(texels, laid.others, witnesses)
@@ -120,7 +171,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
     below, rests, foreign = _told_by_colours(shown, colours, inside, filled)
     hole = (shown.hole & ~below) | rests
     below &= ~hole
-    return Chart(
+    chart = Chart(
         **vars(laid),
         there=shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
@@ -132,6 +183,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Seq
         scatter=scatter,
         tolerance=tolerance,
     )
+    return chart, shown.spread
 
 
 def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float) -> Surface | None:
@@ -193,7 +245,8 @@ def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], toler
     several = there & (photos > 1) & ~hole
     known = several & (spread <= limit + MISPLACED * loud)
     image = np.where(hole[..., None], below, image)
-    return _Shown(there, image, photos, hiding, known, several & alike, hole, alike_below)
+    spread = np.where(several, spread, np.float32(np.nan))
+    return _Shown(there, image, photos, hiding, known, several & alike, hole, alike_below, spread)
 
 
 def _told_by_colours(
