@@ -87,6 +87,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
+    "surfaces too close for rough depths are all there": (
+        ("gimp3d.stages.charts:_parted", lambda drawn, _: [chart for chart, _ in drawn]),
+    ),
     "one photo tells that the surface ends": (
         ("gimp3d.stages.charts:_through", lambda said: (said == Says.THROUGH).sum(0)),
     ),

@@ -397,8 +397,9 @@ def test_a_floor_ends_at_a_wall_and_the_wall_at_the_floor(which: int, heights: t
     assert not hole[~hidden_everywhere(eyes, points, 0.06)].any()
 
 
-def test_parallel_surfaces_do_not_end_each_other(floor_room: Room, floor_chart: Chart) -> None:
-    planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, 0.005)]
+@pytest.mark.parametrize("height", [0.005, 0.4])
+def test_parallel_surfaces_do_not_end_each_other(height: float, floor_room: Room, floor_chart: Chart) -> None:
+    planes = [Plane.make(np.array([0, 0, h]), UP, REGION) for h in (0.0, height)]
     first = charts_of(planes, floor_room.witnesses)[0]
     np.testing.assert_array_equal(first.there, floor_chart.there)
 
