@@ -216,6 +216,8 @@ def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest:
         texel = max(pixel, float(size.max()) / largest)
         if pixel < math.inf and shown * pixel / texel > best:
             best, found = shown * pixel / texel, (place, size, texel)
+        if pixel == texel < math.inf:
+            break  # it is as fine as photos
     return flat_surface(plane, *found) if found else None
 
 
