@@ -613,6 +613,13 @@ def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:
     assert there[20:40, 30:37].all() and not there[20:40, 44:].any()
 
 
+def test_a_single_photo_tells_where_a_surface_ends() -> None:
+    said = np.full((1, 40, 60), Says.SEEN, np.uint8)
+    said[:, :, 30:] = Says.THROUGH
+    there = stage.shown_there(said)
+    assert there[:, :25].all() and not there[:, 35:].any()
+
+
 def test_a_far_end_that_one_view_looks_at_costs_the_rest_no_detail() -> None:
     """Close views do not frame the floor's far end, which the block hides in a low one."""
     close = tuple(replace(c, fx=3.5 * c.fx, fy=3.5 * c.fy) for c in EYES)

@@ -37,9 +37,7 @@ GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
 SAMPLES = 128  # colours of each kind, squared, that the models of both are made of
 SOFT = 8  # texels round a hole that may show some of the object
-ALONG = (
-    16.0  # texels, σ of the neighbourhood that says which of two close surfaces is there; textures take half of that
-)
+ALONG = 16.0  # texels, σ of the neighbourhood that says which of two close surfaces is there
 CLEARLY = 0.9  # share of what photos differ by on one surface, below which the other one is there
 MEETING = 0.25  # share of what photos show of a chart that may lie behind another one which bounds it
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
@@ -366,9 +364,10 @@ def _unseen(said: np.ndarray) -> np.ndarray:
 
 
 def _through(said: np.ndarray) -> np.ndarray:
-    """[H, W] in how many photos something behind it is seen: not one alone, whose mask may have a gap."""
-    count = (said == Says.THROUGH).sum(0)
-    return np.where(count > 1, count, 0)
+    """[H, W] in how many photos something behind it is seen: not one alone, where others have the object in the way,
+    as its mask may have a gap."""
+    count, hidden = ((said == s).sum(0) for s in (Says.THROUGH, Says.HIDDEN))
+    return np.where((count == 1) & (hidden > 1), 0, count)
 
 
 def shown_there(said: np.ndarray) -> np.ndarray:
