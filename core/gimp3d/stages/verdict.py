@@ -36,7 +36,7 @@ UNLIKE = 24.0  # grey levels from which the object differs from what is behind i
 USUAL_ERROR = 65.0  # squared grey levels by which scenes miss photos, where there are none (30 dB)
 LEAST_ERROR = 1.0  # of 8-bit pictures
 HALF = 9.0  # times the error of the surroundings that scores ½ when it is added: 10 dB worse
-GOOD, FAIR = 0.75, 0.5  # scores
+GOOD, FAIR = 2 / 3, 0.5  # scores
 FINE = 2.0  # px, σ of the blur that leaves no detail
 OTHER_DETAIL = "the fill has {:.1f} times the detail of its surroundings: paint one view, or try another seed"
 SOUND = (  # figures of the verdict, between which values nothing is amiss, and words for what is
@@ -153,7 +153,7 @@ def _summed(
     error = max(LEAST_ERROR, float(np.mean([look.error for look in looks]))) if with_photos else USUAL_ERROR
     before = _mean(*(_squared(look.before, look.photo)[look.ring] for look in looks))
     after = _mean(*(_squared(look.after, look.photo)[look.ring] for look in looks))
-    added, alike = _added_error(sample), _alike(looks, parts, sample)
+    added, alike = max(0.0, _expected_error(sample) - error), _alike(looks, parts, sample)
     verdict = Verdict(
         score=1 / (1 + added / (HALF * error)),
         open_share=open_share,
@@ -169,15 +169,14 @@ def _summed(
     return replace(verdict, words=_words(verdict))
 
 
-def _added_error(sample: _Sample) -> float:
-    """The mean squared error to be expected of the object's pixels beyond that of the scene itself, grey levels²."""
+def _expected_error(sample: _Sample) -> float:
+    """The mean squared error to be expected of the object's pixels, grey levels²."""
     photo, picture, unseen = sample.object & sample.told, sample.object & sample.given, sample.unseen
-    missed, variance, usual = sample.missed, sample.variance, _mean(sample.usual[~sample.object])
-    # What other views show differs from what this one sees: by as much as it does round the object, nothing is wrong.
+    missed, variance = sample.missed, sample.variance
     # Where nothing shows a place, the truth differs from what is expected as texture does, however little the fill.
     errors = (
-        max(0.0, _mean(missed[photo]) - usual),
-        max(0.0, _mean(missed[picture]) - usual) + _mean(variance[picture]),
+        _mean(missed[photo]),
+        _mean(missed[picture]) + _mean(variance[picture]),
         max(_mean(missed[unseen]), _mean(variance[unseen])),
     )
     return float(np.average(errors, weights=[int(where.sum()) for where in (photo, picture, unseen)]))
