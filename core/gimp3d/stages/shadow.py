@@ -150,19 +150,35 @@ def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], regi
 
 
 def marked_shadow(
-    masks: Sequence[np.ndarray | None], grounds: Sequence[Ground], witnesses: Sequence[Witness]
+    masks: Sequence[np.ndarray | None],
+    grounds: Sequence[Ground],
+    witnesses: Sequence[Witness],
+    cast: Shadow | str,  # what the object casts, see find_shadow
 ) -> Shadow | str:
     """The shadow that a user marked, in masks [H, W] bool of the witnesses' views, None where there is none: where most
     of them see it on a ground, as dark as photos show it there.
 
-    Its edge is as soft as photos show it: shapes of several softnesses share the strength.
+    What the object casts there is darker in some places than in others; if that explains less than evenly dark shapes
+    do, they tell. Their edge is as soft as photos show it: several softnesses share the strength.
     """
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
     shapes = [_marked_on(ground, masks, witnesses) for ground in grounds]
-    shadows = np.concatenate([s[g.known] for s, g in zip(shapes, grounds)])
     lit = Shading.make([Receiver.make(g) for g in grounds], LEVELS)
-    strength, besides = lit.fit(shadows)
+
+    def fitted(of: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Shadows [T, S] where grounds are known, strengths, what is besides, and the loss."""
+        shadows = np.concatenate([s[g.known] for s, g in zip(of, grounds)])
+        strength, besides = lit.fit(shadows)
+        return shadows, strength, besides, lit.loss(lit.residual(shadows @ strength, besides))
+
+    shadows, strength, besides, loss = fitted(shapes)
+    if isinstance(cast, Shadow):
+        sizes = [g.known.shape[::-1] for g in grounds]
+        taken = tuple(_within(shape[..., -1], t) for shape, t in zip(shapes, cast.taken))
+        whole = [cv2.resize(t.mean(-1), size, interpolation=cv2.INTER_AREA)[..., None] for t, size in zip(taken, sizes)]
+        if fitted(whole)[-1] < loss:
+            return Shadow(tuple(grounds), None, (), taken, cast.explained, 1.0, f"where it is marked: {cast.reason}")
     if strength.sum() < FAINT:
         return "what is marked as shadow is not darker than what is round it: nothing is lifted"
     explained = lit.explained(shadows @ strength, besides)
@@ -170,6 +186,13 @@ def marked_shadow(
     words = f"{strength.sum():.0%} of the light is missing where it is marked; {explained:.0%} is explained"
     taken = tuple(np.minimum(s @ tints, 1 - DARK).astype(np.float32) for s in shapes)
     return Shadow(tuple(grounds), None, (), taken, explained, 1.0, words)
+
+
+def _within(mark: np.ndarray, taken: np.ndarray) -> np.ndarray:
+    """[h, w, 3]: the light that is taken [h, w, 3] in a mark with soft edges [H, W], and a little beyond: it ends there
+    without an edge of its own."""
+    inside = np.minimum(2 * cv2.resize(mark, taken.shape[1::-1]), 1)
+    return (inside[..., None] * taken).astype(np.float32)
 
 
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:

@@ -224,10 +224,9 @@ def find_light(
         bare = bare_photos(reflection, witnesses)
         witnesses = [replace(w, photo=photo) for w, (photo, *_) in zip(witnesses, bare)]
         grounds = look_at(planes, witnesses, region)
+    shadow = find_shadow(gone, planes[0], grounds, region)
     if settings.shadow == "mask":
-        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses)
-    else:
-        shadow = find_shadow(gone, planes[0], grounds, region)
+        shadow = marked_shadow([shadow_masks.get(v.id) for v in views], grounds, witnesses, shadow)
     return Relit(reflection, shadow)
 
 
