@@ -39,7 +39,7 @@ DIFFERS = 0.04  # share of white by which photos with and without the shadow dif
 GLOSSY = (0.1, 0.2, 0.4)  # share of light that comes back from a floor
 DRAWS, KEPT = 10, 0.8  # of each scene; of the views in a draw
 DARK = 4e-3  # of linear light, below which darkness is noise
-WAYS = {"undone": ["--shadow", "auto"], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}
+WAYS = {"undone": ["--shadow", "auto"], "marked": [], "left": ["--shadow", "off"], "filled": ["--shadow", "off"]}
 
 
 def main() -> None:
@@ -78,8 +78,9 @@ def removals(scene: Scene, folder: Path) -> Iterator[list[str]]:
     shadows = shadows_of(scene)
     for way, words in WAYS.items():
         out, summary = folder / way / "out.ply", folder / way / "summary.json"
-        marked = marked_words({c.id: shadows[c.id] for c in scene.train}, folder) if way == "filled" else []
-        if message := gimp3d([*remove_words(scene, out), *words, *marked, "--summary", str(summary)]):
+        if way in ("marked", "filled"):
+            words = [*words, *marked_words({c.id: shadows[c.id] for c in scene.train}, folder, way == "marked")]
+        if message := gimp3d([*remove_words(scene, out), *words, "--summary", str(summary)]):
             yield [scene.name, way, f"refused: {message}", *[""] * 7]
             continue
         render_views(out, scene.folder / "transforms.json", folder / way / "render", split="test")

@@ -1,8 +1,8 @@
 """Whole removals on real scenes with truth, and on a real scan without: scores, rings, T, verdicts and pictures.
 
 Each scene is run with the true picture of its first test view and without any, as `gimp3d` in a process of its own.
-Scenes with a shadow are run as they are, and with the true shadow marked. Writes OUT/real.json and OUT/real.md
-with a sheet of pictures per run. Run by `make bench-real`.
+Scenes with a shadow are run as they are, and with the true shadow marked, which the paper's preset fills. Writes
+OUT/real.json and OUT/real.md with a sheet of pictures per run. Run by `make bench-real`.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def masks(scene: Scene, marked: bool, folder: Path, reuse: bool) -> dict[str, fl
         words = ["masks", *scene_words(scene), "--out", str(targets)]
         if message := gimp3d([*words, *(shadow_words(scene, folder) if marked else [])]):
             raise BadInput(message)
-    return coverage(scene, targets, marked)
+    return coverage(scene, targets)
 
 
 def baselines(scene: Scene, marked: bool, folder: Path) -> dict[str, Path]:
@@ -150,7 +150,8 @@ def measured(scene: Scene, run: Run, folder: Path, reuse: bool) -> Row:
         if run.given:
             reference = scene.test[0].id
             words += ["--reference", reference, "--reference-image", str(scene.folder / reference)]
-        if message := gimp3d([*words, *(shadow_words(scene, folder.parent) if run.marked else [])]):
+        marked = shadow_words(scene, folder.parent, run.preset != PAPER) if run.marked else []
+        if message := gimp3d([*words, *marked]):
             write(refused, message)
     if refused.exists():
         return {"refused": refused.read_text()}
@@ -248,18 +249,17 @@ def outside_hidden_volume(
     return beside | ~framed
 
 
-def coverage(scene: Scene, targets: Path, marked: bool) -> dict[str, float]:
+def coverage(scene: Scene, targets: Path) -> dict[str, float]:
     """T in the training views, as `gimp3d masks` wrote it, against what no view sees.
 
-    "covered": share of never-seen pixels that T holds; "area": T's over theirs, without a marked shadow, which is T as
-    it was asked for; "invented": share of what the object hides that is in T although some view sees it.
+    "covered": share of never-seen pixels that T holds; "area": T's over theirs; "invented": share of what the object
+    hides that is in T although some view sees it.
     """
     sums = np.zeros(5)
     for camera in scene.train:
         target = read_mask(targets / f"{output_name(camera.id)}.png")
         mask, unseen = scene.hides(camera), scene.unseen(camera)
-        own = target & ~scene.shadow(camera) if marked else target
-        sums += [m.sum() for m in (target & unseen, own, target & mask & ~unseen, unseen, mask)]
+        sums += [m.sum() for m in (target & unseen, target, target & mask & ~unseen, unseen, mask)]
     found, own_pixels, invented, never_seen, hidden = sums.tolist()
     least = max(1, never_seen)
     return {"covered": found / least, "area": own_pixels / least, "invented": invented / max(1, hidden)}

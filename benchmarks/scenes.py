@@ -226,14 +226,14 @@ def remove_words(scene: Scene, out: Path) -> list[str]:
     return ["remove", *scene_words(scene), "--out", str(out)]
 
 
-def marked_words(masks: Mapping[str, np.ndarray], folder: Path) -> list[str]:
-    """How a command is told of masks, ID → [H, W] bool, that are filled as well."""
+def marked_words(masks: Mapping[str, np.ndarray], folder: Path, lifted: bool) -> list[str]:
+    """How a command is told of the shadow's masks, ID → [H, W] bool: it is lifted there, or filled as well."""
     marks = folder / "shadows"
     for name, mask in masks.items():
         write_png(marks / f"{output_name(name)}.png", mask)
-    return ["--extra-masks", str(marks)]
+    return ["--shadow", "mask", "--shadow-masks", str(marks)] if lifted else ["--extra-masks", str(marks)]
 
 
-def shadow_words(scene: Scene, folder: Path) -> list[str]:
+def shadow_words(scene: Scene, folder: Path, lifted: bool = True) -> list[str]:
     """How a command is told of the true shadow: the only place that knows."""
-    return marked_words({c.id: scene.shadow(c) for c in scene.train}, folder)
+    return marked_words({c.id: scene.shadow(c) for c in scene.train}, folder, lifted)
