@@ -37,7 +37,7 @@ from .raster import RasterSettings, render
 from .report import summary_of, write_charts, write_removal_report
 from .run import Run
 from .stages.charts import chart_number
-from .stages.masks import MaskSettings
+from .stages.masks import MaskSettings, spread_views
 from .stages.propagate import to_bytes
 from .steps.references import charts_to_paint
 
@@ -275,16 +275,18 @@ def run_removal(
     file = read_scene(Path(job.scene))
     region = read_region(Path(job.roi))
     reference = job.reference and job.reference.removeprefix("./")
-    cameras = _removal_cameras(job, reference)
+    available = _removal_cameras(job, reference)
+    extra = _read_marks("--extra-masks", job.extra_masks, available)
+    shadow = _read_marks("--shadow-masks", job.shadow_masks, available)
+    marked = {name for masks in (extra, shadow) for name, mask in masks.items() if mask.any()}
+    cameras = spread_views(available, region, settings.views, marked | {reference or ""})
     pixels = sum(c.width * c.height for c in cameras)
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
     announce_compilation(lambda text: progress("compile", 0, 1, text))
     scene = _precise(file)
     views = _load_views(cameras, job.images, scene)
     picture = read_image(Path(job.reference_image)) if job.reference_image else None
-    extra = _read_marks("--extra-masks", job.extra_masks, cameras)
-    shadow = _read_marks("--shadow-masks", job.shadow_masks, cameras)
-    progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} views")
+    progress("read", 1, 1, f"{len(file.gaussians)} Gaussians, {len(views)} of {len(available)} views")
     key = _job_key(job, views, (extra, shadow)) if folder else ""
     shared = SharedStages(BEFORE_FILL if job.variants > 1 else ())
     given = (reference, picture, progress, shared, extra, shadow, allow_network)

@@ -25,6 +25,7 @@ from .stages.selection import SelectionSettings
 class RemovalSettings:
     """Every stage's settings, and the providers of what no view shows."""
 
+    views: int = 64  # number; of views that the program uses at most, far from each other; 0: all
     masks: MaskSettings = MaskSettings()
     charts: ChartSettings | None = ChartSettings()  # None: photos are the only references (paper)
     clearing: ClearingSettings = ClearingSettings()
@@ -46,10 +47,11 @@ class RemovalSettings:
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
+    "draft": RemovalSettings(views=32, extra_references=1, extra_gain=0.02),
     "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
-    "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
+    "best": RemovalSettings(views=128, refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
+        views=0,
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),
         charts=None,
         depth=DepthSettings(surface="harmonic", scale_factor=0.1),

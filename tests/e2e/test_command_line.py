@@ -192,6 +192,21 @@ def test_variants_that_cannot_be_are_refused(
     assert not any(tmp_path.iterdir())
 
 
+def test_of_many_views_some_are_used_those_that_are_named_among_them(scene_folder: Path, tmp_path: Path) -> None:
+    last = cameras()[-1].id
+    marks = {c.id: np.zeros((c.height, c.width), bool) for c in cameras()}
+    marks[cameras()[-2].id][5:9, 5:9] = True
+    for name, mask in marks.items():
+        write_png(tmp_path / "marks" / f"{output_name(name)}.png", mask)
+    written = ("--views-out", tmp_path / "v", "--summary", tmp_path / "s.json")
+    words = ("--set", "views=3", "--reference", last, "--extra-masks", tmp_path / "marks")
+    remove(scene_folder, tmp_path / "o.ply", "--preset", "draft", *words, *written)
+    masks = next(s for s in read_json(tmp_path / "s.json")["stages"] if s["name"] == "masks")
+    assert "3 views see the region" in masks["reason"]
+    painted = {str(p.relative_to(tmp_path / "v")) for p in (tmp_path / "v").rglob("*.png")}
+    assert {f"{output_name(c.id)}.png" for c in cameras()[-2:]} <= painted
+
+
 def test_a_given_reference_picture_is_used(scene_folder: Path, tmp_path: Path) -> None:
     reference = cameras()[0]
     true = render_bytes(truth(), reference)

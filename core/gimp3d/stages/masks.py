@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -142,6 +142,12 @@ def find_masks(
     if inside[gaussians.usable].all():
         raise IllPosed("ROI: it holds the whole scene; nothing would be left to fill from, make it smaller")
     outlined = _outlined(region, cameras)
+    if not outlined:
+        within = sum(bool(in_region(region, c.centre[None])[0]) for c in cameras)
+        raise IllPosed(
+            f"no usable view: of {len(cameras)} cameras {within} are inside the ROI and the others do not frame it; "
+            "add views that look at it from outside"
+        )
     photos, extra, rule = photos or {}, extra or {}, settings.selection
     over = _counting(progress, 3 * len(outlined))
 
@@ -176,14 +182,32 @@ def _outlined(region: Region, cameras: Sequence[Camera]) -> list[tuple[Camera, l
     """The cameras that see the region from outside, each with the boxes' outlines [M, 2] in pixels."""
     usable = [c for c in cameras if not in_region(region, c.centre[None])[0]]
     outlines = [(c, [p for box in region if (p := box_polygon(box, c)) is not None]) for c in usable]
-    found = [(c, polygons) for c, polygons in outlines if any(fill_polygon(p, c).any() for p in polygons)]
-    if not found:
-        within = len(cameras) - len(usable)
-        raise IllPosed(
-            f"no usable view: of {len(cameras)} cameras {within} are inside the ROI and the others do not frame it; "
-            "add views that look at it from outside"
-        )
-    return found
+    return [(c, polygons) for c, polygons in outlines if any(fill_polygon(p, c).any() for p in polygons)]
+
+
+def spread_views(
+    cameras: Sequence[Camera],
+    region: Region,
+    most: int,  # 0: all
+    needed: Collection[str] = (),  # IDs of those that have to be among them
+) -> tuple[Camera, ...]:
+    """At most so many cameras of those that see the region, in their order, as far from each other as can be.
+
+    What a view right beside another one shows is known already (farthest points, Gonzalez 1985).
+    """
+    if not 0 < most < len(cameras):
+        return tuple(cameras)
+    seeing = {c.id for c, _ in _outlined(region, cameras)}
+    candidates = [c for c in cameras if c.id in seeing or c.id in needed]
+    places = np.array([c.centre for c in candidates]).reshape(-1, 3)
+    away = np.full(len(places), np.inf)
+    chosen = [k for k, c in enumerate(candidates) if c.id in needed]
+    for k in chosen:
+        away = np.minimum(away, np.linalg.norm(places - places[k], axis=1))
+    while len(chosen) < min(most, len(places)):
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, np.linalg.norm(places - places[chosen[-1]], axis=1))
+    return tuple(candidates[k] for k in sorted(chosen))
 
 
 def _counting(progress: Progress, total: int) -> Callable[[Callable[[T], R], Iterable[T]], list[R]]:

@@ -362,3 +362,34 @@ def test_what_a_view_keeps_small_reads_as_it_was(seed: int, height: int, width: 
     assert (view.depth_after == after[0]).all()
     with pytest.raises(FrozenInstanceError):
         view.target = bits[0]  # type: ignore[misc]
+
+
+@examples(20)
+@given(seed=st.integers(0, 1000), most=st.integers(1, 30), needed=st.integers(0, 4))
+def test_views_that_are_used_are_far_from_each_other_and_see_the_region(seed: int, most: int, needed: int) -> None:
+    rng = np.random.default_rng(seed)
+    around = cameras(12, 60, 45)
+    up = np.array([0.0, 0.0, 1.0])
+    beside = [  # right beside another one, and one that looks away
+        *(replace(c, id=f"b{k}", viewmat=look_at(c.centre + 1e-3, np.zeros(3), up)) for k, c in enumerate(around)),
+        replace(around[0], id="away", viewmat=look_at(around[0].centre, 2 * around[0].centre, up)),
+    ]
+    available = [[*around, *beside][k] for k in rng.permutation(25)]
+    names = {available[k].id for k in rng.permutation(25)[:needed]} | {"unknown"}
+    used = [c.id for c in stage.spread_views(available, REGION, most, names)]
+    if most >= 25:
+        assert used == [c.id for c in available]
+        return
+    assert used == [c.id for c in available if c.id in used]
+    names -= {"unknown"}
+    assert names <= set(used) and len(used) == max(len(names), min(most, 24 + ("away" in names)))
+    assert "away" in names or "away" not in used
+    if not names and most <= 12:
+        places = {c.id: c.centre for c in available}
+        assert min([np.linalg.norm(places[a] - places[b]) for a in used for b in used if a != b], default=1.0) > 0.1
+
+
+def test_all_views_are_used_if_no_number_is_asked() -> None:
+    around = cameras(5, 60, 45)
+    assert [c.id for c in stage.spread_views(around, REGION, 0)] == [c.id for c in around]
+    assert stage.spread_views([], REGION, 3) == ()
