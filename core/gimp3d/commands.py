@@ -198,16 +198,19 @@ def write_masks(
     loaded = _load_views(looked_at, images, given)
     masks = MaskSettings(mode=mode, grow=grow)  # type: ignore[arg-type]
     run = Run(RemovalSettings(masks=masks, depth_prior=depth_prior, shadow=shadow_of(shadow, shadow_masks)), progress)
-    extra = _read_marks("--extra-masks", extra_masks, looked_at)
-    marked = _read_marks("--shadow-masks", shadow_masks, looked_at)
+    marks = _read_marks("--extra-masks", extra_masks, looked_at), _read_marks("--shadow-masks", shadow_masks, looked_at)
     frame = frame_of(given, available)
-    behind = look(run, frame, given, loaded, region, extra, marked)
+    behind = look(run, frame, given, loaded, region, *marks)
     seen = {v.id: v for v in behind.views}
     if pictures:
         write_json(pictures / "proposed.json", frame.proposed_back(behind.masks.proposed))
         write_json(pictures / "light.json", behind.lit.facts())
         if all(c.split == "train" for c in written):
-            charts = charts_to_paint(behind.charts, behind.views)
+            used = {c.id for c in spread_views(looked_at, region, run.settings.views, _marked(marks))}
+            removal = behind  # which uses no more views
+            if len(used) < len(loaded):
+                removal = look(run, frame, given, [v for v in loaded if v.camera.id in used], region, *marks)
+            charts = charts_to_paint(removal.charts, removal.views)
             write_charts(pictures / "charts", frame.charts_back(charts))
     for camera in written:
         name, view = output_name(camera.id), seen.get(camera.id)
@@ -278,8 +281,7 @@ def run_removal(
     available = _removal_cameras(job, reference)
     extra = _read_marks("--extra-masks", job.extra_masks, available)
     shadow = _read_marks("--shadow-masks", job.shadow_masks, available)
-    marked = {name for masks in (extra, shadow) for name, mask in masks.items() if mask.any()}
-    cameras = spread_views(available, region, settings.views, marked | {reference or ""})
+    cameras = spread_views(available, region, settings.views, _marked((extra, shadow)) | {reference or ""})
     pixels = sum(c.width * c.height for c in cameras)
     require_memory(VIEW_PIXEL * pixels + GAUSSIAN * len(file.gaussians), f"a removal with {len(cameras)} views")
     announce_compilation(lambda text: progress("compile", 0, 1, text))
@@ -391,6 +393,11 @@ def _read_marks(option: str, folder: Path | str | None, cameras: Sequence[Camera
     if not masks:
         raise BadInput(f"{option}: {folder} holds no mask of a view, such as {paths[cameras[0].id]}")
     return masks
+
+
+def _marked(marks: Sequence[Mapping[str, np.ndarray]]) -> set[str]:
+    """The IDs of views in which something is marked."""
+    return {name for masks in marks for name, mask in masks.items() if mask.any()}
 
 
 def _job_key(job: RemovalJob, views: Sequence[View], marks: Sequence[Mapping[str, np.ndarray]]) -> str:

@@ -47,9 +47,9 @@ class RemovalSettings:
 
 
 PRESETS: dict[str, RemovalSettings] = {
-    "draft": RemovalSettings(views=32, extra_references=1, extra_gain=0.02),
+    "draft": RemovalSettings(extra_references=1, extra_gain=0.02),
     "balanced": RemovalSettings(refine=RefineSettings(steps=100)),
-    "best": RemovalSettings(views=128, refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
+    "best": RemovalSettings(refine=RefineSettings(steps=400), extra_references=4, extra_gain=0.005),
     "paper": RemovalSettings(
         views=0,
         masks=MaskSettings(mode="paper", selection=SelectionSettings(by_centre=True)),

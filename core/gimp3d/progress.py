@@ -18,7 +18,7 @@ ORDER = (
     "appearance", "seed", "mapping", "propagate", "settle", "refine", "recolour", "verdict",
 )  # fmt: skip
 STEPS = {"balanced": 100, "best": 400, "paper": 3000, "paper-literal": 3000}  # of refinement; others 0
-VIEWS = {"draft": 32, "balanced": 64, "best": 128}  # that are used at most; others use all
+VIEWS = 64  # that the former use at most; others use all
 # s of a stage: constant, for each million pixels of all views, for each million Gaussians in each view
 STAGES = {
     "read": (0.213, 0.074, 0.114),
@@ -74,10 +74,10 @@ class Forecast:
 
 def forecast_removal(gaussians: int, views: int, pixels: int, preset: str = "balanced") -> Forecast:
     """What a removal will roughly take, of `pixels` in all views: one chart, or one view, and a shadow that stays."""
-    used = min(views, VIEWS.get(preset, views))
-    pixels, views = pixels * used // max(1, views), used
-    work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
     charted = preset in CHARTED
+    if charted and views > VIEWS:
+        pixels, views = pixels * VIEWS // views, VIEWS
+    work = (1.0, pixels / 1e6, gaussians / 1e6 * views)
     other = ON_VIEWS if charted else ON_CHARTS
     stages = {name: _sum(cost, work) for name, cost in STAGES.items() if name not in other}
     if steps := STEPS.get(preset, 0):

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 from scenes import REGION, cameras, scene, truth
 
-from gimp3d import behind, filling, pipeline
+from gimp3d import behind, commands, filling, pipeline
 from gimp3d.camera import output_name
 from gimp3d.cli import main
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import read_ply, write_gaussians
 from gimp3d.pipeline import render_bytes
+from gimp3d.stages.masks import spread_views
 from gimp3d.steps import references
 
 
@@ -249,6 +250,19 @@ def test_charts_are_written_for_painting(scene_folder: Path, completed: Path, tm
     run("render", completed / "out.ply", *seen)
     drawn = read_image(tmp_path / "seen" / "1.png").astype(float)
     assert np.abs(drawn - pictures[1])[hole].mean() < 12  # the cameras are those of the pictures
+
+
+def test_charts_for_painting_are_of_the_views_that_a_removal_uses(
+    scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = lambda available, region, most, needed: spread_views(available, region, 4, needed)  # noqa: E731
+    monkeypatch.setattr(commands, "spread_views", few)
+    run("masks", *files_of(scene_folder), "--out", tmp_path / "t", "--pictures", tmp_path, "--progress", "none")
+    remove(scene_folder, tmp_path / "o.ply", "--preset", "draft", "--views-out", tmp_path / "v")
+    assert len(list((tmp_path / "t").rglob("*.png"))) == len(cameras())
+    assert len(list((tmp_path / "v" / "orbit").iterdir())) == 4
+    for name in ("transforms.json", "1.hole.png"):
+        assert (tmp_path / "charts" / name).read_bytes() == (tmp_path / "v" / "charts" / name).read_bytes()
 
 
 def test_a_painted_chart_rules_its_hole(scene_folder: Path, completed: Path, tmp_path: Path) -> None:
