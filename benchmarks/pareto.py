@@ -178,15 +178,16 @@ def draw_pareto(rows: Sequence[Row], path: Path) -> None:
     lines = math.ceil(len(scenes) / 2)
     words = "PSNR where no view looks, against seconds of a whole removal; area: Gaussians added"
     with figure(path, "Speed and accuracy of whole removals", words, 11, 3.6 * lines) as fig:
-        axes = fig.subplots(lines, 2, squeeze=False).flat
+        axes = list(fig.subplots(lines, 2, squeeze=False).flat)
         for ax, scene in zip(axes, scenes):
             bubbles(ax, scene, where(chosen, scene=scene))
-        for ax in list(axes)[len(scenes) :]:
+        for ax in axes[len(scenes) :]:
             ax.set_axis_off()
 
 
 def bubbles(ax: Axes, scene: str, rows: Sequence[Row]) -> None:
     ax.set_xscale("log")
+    ax.margins(0.1)  # bubbles are large
     ends, opened = [], ""
     for row in rows:
         if row["method"] == "hole open":
