@@ -13,6 +13,7 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.geometry import SOLID
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import surface_depth
+from gimp3d.stages import verdict
 from gimp3d.stages.charts import Chart, Hits, Plane
 from gimp3d.stages.clearing import ClearingSettings, chart_targets, object_pixels
 from gimp3d.stages.masks import ViewMasks
@@ -195,6 +196,17 @@ def test_a_given_picture_tells_what_no_photo_shows(plain: Case, patch: Gaussians
     rough = replace(plain, charts=tuple(replace(c, noise=0.2 * BLOCK) for c in plain.charts))
     assert rough.judged(patch, given=picture).score < told.score - 0.02
     assert rough.judged(patch).score == pytest.approx(good.score, abs=0.01)
+
+
+@pytest.mark.parametrize("rough", [0.0, 400.0])
+def test_how_rough_a_scan_is_excuses_no_error(rough: float) -> None:
+    """The object's pixels miss photos and a given picture by 100 grey levels², whatever those round it do."""
+    no, half = np.zeros(40, bool), np.arange(40) < 20
+    told, given = np.arange(40) % 2 == 0, half & (np.arange(40) % 2 == 1)
+    missed, usual = np.full((2, 40), 100.0)
+    usual[~half] = rough
+    sample = verdict._Sample(half, told, given, no, usual, missed, np.zeros(40), np.zeros((40, 3)), np.zeros((40, 3)))
+    assert verdict._expected_error(sample) == pytest.approx(100.0)
 
 
 def test_nothing_to_judge(plain: Case, patch: Gaussians) -> None:
