@@ -20,7 +20,18 @@ from ...geometry import dilated, framed, sees
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
-from .find import TELLING, TOLERANCE, ChartSettings, Laid, flat_surface, grid, lay_surface, pixel_density, pixel_size
+from .find import (
+    TELLING,
+    TOLERANCE,
+    ChartSettings,
+    Laid,
+    depth_scatter,
+    flat_surface,
+    grid,
+    lay_surface,
+    pixel_density,
+    pixel_size,
+)
 from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
 from .plane import Hits as Hits
@@ -43,9 +54,6 @@ MEETING = 0.25  # share of what photos show of a chart that may lie behind anoth
 PLACES = 200  # along a side of four diagonals, at which what the object hides is sought
 TRIMMED = np.linspace(0, 0.2, 21)  # shares of the hidden pixels, on each side, without which a chart is tried
 MARGIN, LEAST_MARGIN = 0.75, 0.15  # of a hole's size, and diagonals: surface round it to fill it from
-SURFACE = 5000  # points of a chart at which drawn depths are compared
-SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
-MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that lie on another surface
 
 
 @dataclass(frozen=True)
@@ -161,7 +169,7 @@ def _chart(
     """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
     points, shape = laid.points(), laid.depth.shape
     texels = points.reshape(-1, 3)
-    scatter = _scatter(texels, laid.others, witnesses)
+    scatter = depth_scatter(_before(texels, laid.others), witnesses)
     tolerance = max(TOLERANCE, scatter)
     shown = _shown(points, laid.plane, witnesses, tolerance)
     colours = _object_colours(laid.plane, witnesses, tolerance)
@@ -339,21 +347,13 @@ def _marked(points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[n
     return found
 
 
-def _scatter(surface: np.ndarray, others: Sequence[Plane], witnesses: Sequence[Witness]) -> float:
-    """How far, relative to z, the views' drawn surfaces scatter about points [N, 3] of one: three standard deviations.
+def _before(surface: np.ndarray, others: Sequence[Plane]) -> np.ndarray:
+    """Of points [N, 3] those before the planes that they may meet, or all if these are few.
 
-    What lies behind the others that it may meet, such as a wall, says nothing of how a floor's depths scatter.
+    What lies behind, such as a wall, says nothing of how a floor's depths scatter.
     """
     before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
-    surface = surface[before] if before.sum() > TELLING else surface
-    some, off = surface[:: max(1, len(surface) // SURFACE)], [np.zeros(0)]
-    for witness in witnesses:
-        _, rows, cols, z = framed(witness.camera, some)
-        front = witness.depth[rows, cols]
-        shown = ~witness.hidden[rows, cols] & (front > 0)
-        off.append(front[shown] / z[shown] - 1)
-    found = np.abs(np.concatenate(off))
-    return min(SCATTER * float(np.median(found)), MOST_SCATTER) if len(found) else 0.0
+    return surface[before] if before.sum() > TELLING else surface
 
 
 def _unseen(said: np.ndarray) -> np.ndarray:

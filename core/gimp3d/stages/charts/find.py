@@ -44,13 +44,16 @@ ENOUGH_POINTS = 3  # of a cell
 TELLING = 100  # cells or texels that tell how depths lie
 HEIGHT = 0.25  # diagonals of the region, of a relief at most: what is higher stands on the surface
 SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
+SURFACE = 5000  # points of a surface at which drawn depths are compared
+SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
+MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that lie on another surface
 
 
 @dataclass(frozen=True)
 class ChartSettings:
     """How surfaces are found and shown."""
 
-    least: float = 0.1  # share of the points round the object; fewer planes against missed ones
+    least: float = 0.05  # share of the points round the object; fewer planes against missed ones
     relief: Share = 0.9  # share of what photos disagree on, on a plane; rather it alone, or reliefs and further planes
     largest: AtLeastOne = 900  # px, side of a chart at most; detail against time
 
@@ -134,7 +137,7 @@ def find_planes(
     all_planes = [plane for plane, _ in sought]
     if not settled:
         return tuple(all_planes)
-    claims = [_Claim(plane, own, _bounds(plane, own, all_planes), diagonal) for plane, own in sought]
+    claims = [_Claim(plane, own, _bounds(plane, own, all_planes), witnesses, diagonal) for plane, own in sought]
     settled_at = [_settled(claim, levels) for claim in claims]
     known = [plane for _, plane in settled_at]
     found = [(*_best_known(c, plane, best, known, textures), c) for c, (best, plane) in zip(claims, settled_at)]
@@ -145,6 +148,18 @@ def find_planes(
         if not planes or 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
             planes.append(plane)
     return tuple(planes)
+
+
+def depth_scatter(points: np.ndarray, witnesses: Sequence[Witness]) -> float:
+    """Three standard deviations, relative to z, of the views' drawn surfaces about points [N, 3] of one."""
+    some, off = points[:: max(1, len(points) // SURFACE)], [np.zeros(0)]
+    for witness in witnesses:
+        _, rows, cols, z = framed(witness.camera, some)
+        front = witness.depth[rows, cols]
+        shown = ~witness.hidden[rows, cols] & (front > 0)
+        off.append(front[shown] / z[shown] - 1)
+    found = np.abs(np.concatenate(off))
+    return min(SCATTER * float(np.median(found)), MOST_SCATTER) if len(found) else 0.0
 
 
 def grid(half: float, count: int) -> np.ndarray:
@@ -170,15 +185,25 @@ class _Claim:
     plane: Plane
     own: Beside
     bounds: list[tuple[Plane, int]]  # see _bounds
+    witnesses: Sequence[Witness]
     half: float  # diagonals of the region
 
-    def agreement(self, textures: Textures, shrink: int = 1) -> Callable[[np.ndarray], float]:
-        """What is to be greatest: how alike photos look on the plane, by its pose."""
+    def agreement(
+        self, textures: Textures, shrink: int = 1, near: Plane | None = None
+    ) -> Callable[[np.ndarray], float]:
+        """What is to be greatest: how alike photos look on the plane, by its pose.
+
+        Where most views see through a plane `near` it, such as beyond a shelf's edge, they show other things.
+        """
         count = POINTS // shrink
         x, y = (g.ravel() for g in grid(self.half, count))
         points, there = self.plane.points(x, y), np.ones(len(x), bool)
         for other, side in self.bounds:
             there &= side * other.local(points)[:, 2] > 0
+        if near is not None:
+            tolerance = max(TOLERANCE, depth_scatter(self.own.some(SURFACE).on(near), self.witnesses))
+            said = ask(self.witnesses, near.under(points), tolerance)
+            there &= (said == Says.THROUGH).sum(0) <= np.isin(said, (Says.SEEN, Says.BESIDE)).sum(0)
         x, y, own = x[there], y[there], self.own.some(count**2 // OWN)
 
         def by(pose: np.ndarray) -> float:
@@ -206,14 +231,14 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
     """
     sweep, tilts = np.linspace(-1, 1, SWEEP) * SEARCH, (-TILT, 0.0, TILT)
     anywhere = [np.array(at) for at in itertools.product(sweep[::2], tilts, tilts)]
-    best, reached = 0.0, list[np.ndarray]()
+    best, reached, near = 0.0, list[np.ndarray](), None
     for shrink, textures in zip(LEVELS, levels):
         finest = shrink == LEVELS[-1]
-        agreement = claim.agreement(textures, shrink)
+        agreement = claim.agreement(textures, shrink, near)
         anew = ([np.array([o, 0.0, 0.0]) for o in sweep], 1) if finest else (anywhere, TRIED)
         starts, least = (*reached, *_best_of(agreement, *anew)), FINE_STEP if finest else COARSE_STEP
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
-        reached = [at]
+        reached, near = [at], claim.at(at)
     return best, claim.at(reached[0]) if best > 0 else claim.plane
 
 
@@ -221,7 +246,7 @@ def _best_known(
     claim: _Claim, plane: Plane, best: float, known: Sequence[Plane], textures: Textures
 ) -> tuple[float, Plane]:
     """Where photos agree better still: climbed from where other claims settled, of one surface that looked like two."""
-    agreement = claim.agreement(textures)
+    agreement = claim.agreement(textures, near=plane)
     starts = [claim.pose_of(p) for p in known if p is not plane and not p.crosses(claim.plane)]
     found = [_climbed(agreement, s, FINE_STEP) for s in _best_of(agreement, starts, 1) if agreement(s) > best]
     return (found[0][0], claim.at(found[0][1])) if found else (best, plane)

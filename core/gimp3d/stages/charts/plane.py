@@ -49,6 +49,10 @@ class Plane:
         h = np.broadcast_to(height, np.shape(x))
         return self.origin + x[..., None] * self.right + y[..., None] * self.down + h[..., None] * self.normal
 
+    def under(self, points: np.ndarray) -> np.ndarray:
+        """Feet of points [N, 3] on the plane, along its normal."""
+        return points - self.local(points)[:, 2:] * self.normal
+
     def local(self, points: np.ndarray) -> np.ndarray:
         """[N, 3]: x, y and height of points."""
         return (points - self.origin) @ np.stack([self.right, self.down, self.normal], axis=1)
