@@ -82,7 +82,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.steps.behind:hiding_rests", lambda witnesses, _: witnesses),
     ),
     "what stands on holes stays if a photo shows it": (
-        ("gimp3d.stages.clearing:stand_on_rests", lambda chart, texels, _: chart.rests[texels]),
+        ("gimp3d.stages.clearing:stand_on_hole", lambda chart, texels, above: np.zeros(len(above), bool)),
     ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),

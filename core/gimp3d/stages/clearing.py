@@ -85,12 +85,9 @@ def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, chart
     return Selection(fates)
 
 
-def stand_on_rests(chart: Chart, texels: tuple[np.ndarray, ...], above: np.ndarray) -> np.ndarray:
-    """[N] bool: of Gaussians over these (rows, cols), so far above the surface, those that are the object's if low.
-
-    On a hole stands nothing but the object; surface that reaches below one stays if some photo shows it.
-    """
-    return chart.rests[texels] | (chart.hole[texels] & (above > 0))
+def stand_on_hole(chart: Chart, texels: tuple[np.ndarray, ...], above: np.ndarray) -> np.ndarray:
+    """[N] bool: of Gaussians over these (rows, cols), so far above the surface, those that stand on its hole."""
+    return chart.hole[texels] & (above > 0)
 
 
 def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
@@ -119,7 +116,8 @@ def clear_air(
     """Remove what only the removal reveals and no photo shows, and rests of the object.
 
     A photo shows a Gaussian by a share of what that draws in the emptied scene: not what lies where the object is, and
-    it does not tell what is right beside that.
+    it does not tell what is right beside that. Low on its rests stands nothing but the object, nor on a hole, unless
+    another surface is known there; surface that reaches below a hole stays if some photo shows it.
     """
     stays, near = ~selection.removed, scene.usable & near_region(scene, region, 1.0)
     kept, rows, fates = scene.take(stays), np.flatnonzero(stays & near), selection.fates.copy()
@@ -132,11 +130,15 @@ def clear_air(
     photos, hidden = total_over(witnesses, of, (2, len(kept)))[:, near[stays]]
     fates[rows[(photos == 0) & (hidden > HAZE_WEIGHT)]] = Fate.REMOVED_REVEALED
     means = scene.means[rows].astype(np.float64)
+    gone, known = np.zeros((2, len(rows)), bool)
     for chart in charts:
         index, *at, z = framed(chart.camera, means)
-        above = chart.depth[tuple(at)] - z
-        gone = stand_on_rests(chart, tuple(at), above) & (np.abs(above) < LOW * extent(region))
-        fates[rows[index[gone]]] = Fate.REMOVED_REVEALED
+        above, texels = chart.depth[tuple(at)] - z, tuple(at)
+        low = np.abs(above) < LOW * extent(region)
+        fates[rows[index[low & chart.rests[texels]]]] = Fate.REMOVED_REVEALED
+        gone[index] |= low & stand_on_hole(chart, texels, above)
+        known[index] |= low & chart.known[texels]
+    fates[rows[gone & ~known]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 

@@ -65,6 +65,7 @@ def room(
     noise: float = 0.0,
     colours: Callable[[np.ndarray], np.ndarray] = texture,
     block: bool = True,
+    front: float = -np.inf,  # y where the first plane ends
 ) -> Room:
     """Photos and depth maps, the latter with relative noise."""
     rng = np.random.default_rng(5)
@@ -72,14 +73,17 @@ def room(
     for camera in eyes:
         shape = (camera.height, camera.width)
         rays = camera.unproject(camera.pixel_centres(), np.ones(shape)) - camera.centre
-        surface = np.min([plane_reach(camera.centre, rays, p) for p in planes], axis=0)
-        front = block_reach(camera.centre, rays) if block else np.full(shape, np.inf)
-        z = np.minimum(surface, front)
+        reach = np.array([plane_reach(camera.centre, rays, p) for p in planes])
+        with np.errstate(invalid="ignore"):
+            reach[0][camera.centre[1] + reach[0] * rays[..., 1] < front] = np.inf
+        surface = reach.min(0)
+        object_at = block_reach(camera.centre, rays) if block else np.full(shape, np.inf)
+        z = np.minimum(surface, object_at)
         shown = np.isfinite(z)
         z = np.where(shown, z, 0)
         photo = np.clip(np.rint(colours(camera.centre + z[..., None] * rays)), 0, 255)
-        photo = np.where((front < surface)[..., None], [200, 20, 20], photo * shown[..., None]).astype(np.uint8)
-        object_ = (front < surface).astype(np.uint8)
+        photo = np.where((object_at < surface)[..., None], [200, 20, 20], photo * shown[..., None]).astype(np.uint8)
+        object_ = (object_at < surface).astype(np.uint8)
         hidden, some = (cv2.dilate(object_, np.ones((n, n), np.uint8)) > 0 for n in (3, 7))
         depth = (z * (1 + noise * rng.normal(size=shape))).astype(np.float32)
         witnesses.append(Witness(camera, photo, hidden, some & ~hidden, ~shown, depth))
@@ -192,12 +196,33 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
 
 
+@pytest.mark.parametrize("low", [-0.5, -1.0])
+def test_a_board_is_not_tilted_by_what_shows_beyond_its_edge(low: float) -> None:
+    """Photos see past a shelf, to a floor below: there they tell nothing of how the shelf lies."""
+    seen = room(front_cameras(LOW), [FLOOR, WALL, (UP, low)], front=-0.3)
+    planes = find_planes(seen.witnesses, REGION)
+    (board,) = (p for p in planes if p.normal @ UP > 0.9)
+    assert board.normal @ UP > np.cos(np.radians(1))
+    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.25, 0.25, 5))
+    assert np.abs(board.points(x, y)[..., 2]).max() < 0.01 * extent(REGION)
+
+
+def test_a_floor_is_found_though_nearly_all_that_is_round_the_object_is_wall() -> None:
+    """From low down the floor is a strip at the object's foot."""
+    seen = room(front_cameras((0.3, 0.4, 0.5)), [FLOOR, WALL])
+    around = find._surface_round(seen.witnesses, REGION)
+    assert around.weight[around.points[:, 1] < 0.37].sum() < 0.1 * around.weight.sum()
+    planes = find_planes(seen.witnesses, REGION)
+    for normal, _ in (FLOOR, WALL):
+        assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
+
+
 def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(floor_room: Room) -> None:
     floor = Plane.make(np.zeros(3), UP, REGION)
     guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)
     textures = Textures.make(floor_room.witnesses)
     around = find._surface_round(floor_room.witnesses, REGION)
-    claim = find._Claim(guess, around, [], extent(REGION))
+    claim = find._Claim(guess, around, [], floor_room.witnesses, extent(REGION))
     elsewhere = claim.agreement(textures)(np.zeros(3))
     agreement, plane = find._best_known(claim, guess, elsewhere, [guess, floor], textures)
     assert agreement > 2 * elsewhere and plane.normal @ UP > np.cos(np.radians(0.2))
@@ -206,7 +231,7 @@ def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(fl
 
 def test_a_claim_s_pose_leads_to_the_plane() -> None:
     plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION)
-    claim = find._Claim(plane, find.Beside(*np.zeros((2, 0, 3)), np.zeros(0)), [], 0.7)
+    claim = find._Claim(plane, find.Beside(*np.zeros((2, 0, 3)), np.zeros(0)), [], [], 0.7)
     other = plane.tilted(0.1, 0.2, -0.1)
     x, y = np.random.default_rng(3).normal(size=(2, 20))
     reached = claim.at(claim.pose_of(other))

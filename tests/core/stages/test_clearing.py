@@ -146,14 +146,31 @@ def with_patch(mask: np.ndarray, chart: Chart, x: float) -> np.ndarray:
     return patched
 
 
+def with_hole(chart: Chart, x: float) -> Chart:
+    hole = with_patch(chart.hole, chart, x)
+    return replace(chart, hole=hole, known=chart.known & ~hole)
+
+
 def test_on_a_hole_stands_nothing_but_the_object(charts: tuple[Chart, ...]) -> None:
     """Though photos show it. What reaches below the hole is surface, and what hangs high above is not on it."""
     given = removal(specks([[OFF, 0, 0.02], [OFF, 0, -0.02], [OFF, 0, 0.6], [-OFF, 0, 0.02]]))
     (chart,) = charts
     before = set(cleared(given, charts=charts))
-    new = set(cleared(given, charts=(replace(chart, hole=with_patch(chart.hole, chart, OFF)),))) - before
+    new = set(cleared(given, charts=(with_hole(chart, OFF),))) - before
     low, below, high, elsewhere = range(len(given.scene) - 4, len(given.scene))
     assert low in new and not {below, high, elsewhere} & new
+
+
+def test_on_a_hole_stands_another_surface_that_is_known_there(charts: tuple[Chart, ...]) -> None:
+    """Books stand on a shelf's hole."""
+    given = removal(specks([[OFF, 0, 0.02], [OFF, 0, 0.2]]))
+    (chart,) = charts
+    holed = with_hole(chart, OFF)
+    raised = replace(chart, depth=chart.depth - np.float32(0.03), hole=np.zeros_like(chart.hole))
+    low = len(given.scene) - 2
+    known, unknown = (replace(raised, known=np.full(chart.known.shape, k)) for k in (True, False))
+    assert low not in cleared(given, charts=(holed, known))
+    assert low in cleared(given, charts=(holed, unknown))
 
 
 def test_rests_are_part_of_the_object_in_photos_that_show_them(plain: Removal, charts: tuple[Chart, ...]) -> None:
