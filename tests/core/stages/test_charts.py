@@ -217,6 +217,20 @@ def test_a_floor_is_found_though_nearly_all_that_is_round_the_object_is_wall() -
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_photos_do_not_judge_a_plane(count: int) -> None:
+    """Three must show a place to agree: with fewer, planes are as they are drawn, and parallel ones are one."""
+    seen = room(front_cameras(LOW)[3 : 3 + count], [FLOOR, WALL])
+    rows = np.where(np.arange(180) % 2, 1.05, 1).astype(np.float32)[:, None]
+    doubled = [replace(w, depth=w.depth * rows) for w in seen.witnesses]
+    for witnesses in (seen.witnesses, doubled):
+        planes = find_planes(witnesses, REGION)
+        assert len(planes) == 2 and planes[0].crosses(planes[1])
+    planes = find_planes(seen.witnesses, REGION)
+    for normal, _ in (FLOOR, WALL):
+        assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1))
+
+
 def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(floor_room: Room) -> None:
     floor = Plane.make(np.zeros(3), UP, REGION)
     guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)

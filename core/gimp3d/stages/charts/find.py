@@ -137,6 +137,9 @@ def find_planes(
     all_planes = [plane for plane, _ in sought]
     if not settled:
         return tuple(all_planes)
+    if len(witnesses) < AGREEING:  # photos do not tell; of rough depths, parallel planes are mostly one surface
+        crossing = [all(plane.crosses(before) for before in all_planes[:k]) for k, plane in enumerate(all_planes)]
+        return tuple(itertools.compress(all_planes, crossing))
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), witnesses, diagonal) for plane, own in sought]
     settled_at = [_settled(claim, levels) for claim in claims]
     known = [plane for _, plane in settled_at]
