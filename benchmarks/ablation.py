@@ -65,6 +65,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:OWN", 10**9),
         ("gimp3d.stages.charts.find:ONE_SIDED", 2.0),
     ),
+    "planes are settled where views see through them, too": (
+        ("gimp3d.stages.charts.find:depth_scatter", lambda *_: np.inf),
+    ),
+    "a plane must hold a tenth of what is round the object": (("charts.least", 0.1),),
     "planes stay where their own pixels settled": (
         ("gimp3d.stages.charts.find:_best_known", lambda claim, plane, best, *_: (best, plane)),
     ),
