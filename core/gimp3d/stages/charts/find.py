@@ -121,10 +121,10 @@ def find_planes(
     Each counts by the square of the share of views in which the object hides it: what is hidden often lies near what is
     hidden always. Planes are then settled where photos' textures agree best, as rough splats' depths do not tell: at
     the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
-    painted on those. Of two planes that could both be what some pixels show photos choose as well.
+    painted on those. Of two planes that could both be what some pixels show photos choose as well. Fewer than three
+    photos cannot judge: the planes are as they are drawn then.
     """
-    diagonal, levels = extent(region), [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
-    textures, cameras = levels[-1], np.array([w.camera.centre for w in witnesses])
+    diagonal, cameras = extent(region), np.array([w.camera.centre for w in witnesses])
     left, rng = _surface_round(witnesses, region), np.random.default_rng(0)
     least, sought = settings.least * left.weight.sum(), list[tuple[Plane, Beside]]()
     for _ in range(MOST):
@@ -140,6 +140,8 @@ def find_planes(
     if len(witnesses) < AGREEING:  # photos do not tell; of rough depths, parallel planes are mostly one surface
         crossing = [all(plane.crosses(before) for before in all_planes[:k]) for k, plane in enumerate(all_planes)]
         return tuple(itertools.compress(all_planes, crossing))
+    levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
+    textures = levels[-1]
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), witnesses, diagonal) for plane, own in sought]
     settled_at = [_settled(claim, levels) for claim in claims]
     known = [plane for _, plane in settled_at]
