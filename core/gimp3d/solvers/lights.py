@@ -7,12 +7,14 @@ are differences between neighbours, coarse and fine, robustly, as edges of textu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sparse
 from scipy.optimize import lsq_linear, minimize
+
+from ..compute.threads import parallel_map
 
 LEAST_NOISE = 0.01  # of log luminance
 CHROMA = 3.0  # times the usual difference of colour, from which an edge is hardly one of light
@@ -146,12 +148,35 @@ class Shading:
 
     def gains(self, changes: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """[S]: by how much each of more shadows, see changes, would lower the loss at its best strength, about."""
+        strength, down, bend = self._best(changes, residual)
+        return strength * down - 0.5 * strength**2 * bend
+
+    def shares(self, changes: np.ndarray, residual: np.ndarray, told: float) -> np.ndarray:
+        """[S]: what share of the loss, noise left out, each of more shadows would explain at its best strength, about,
+        where it makes differences `told` times as large as they usually are."""
+
+        strengths, *_ = self._best(changes, residual)
+
+        def of(k: int) -> float:
+            made = strengths[k] * changes[:, k]
+            there = np.flatnonzero(np.abs(made) > told * self.noise)
+            part = replace(self, noise=self.noise[there], weight=self.weight[there])
+            return part.share(residual[there], residual[there] + made[there])
+
+        return np.array(parallel_map(of, range(changes.shape[1])))
+
+    def share(self, before: np.ndarray, after: np.ndarray) -> float:
+        """What share of the loss of a residual, noise left out, another has less."""
+        lost = self.loss(before)
+        return float(np.clip((lost - self.loss(after)) / max(lost - self.usual_loss, 1e-12), 0, 1))
+
+    def _best(self, changes: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """[S] each: best strengths of shadows, see gains, and how the loss falls with them, and bends."""
         root = np.sqrt(1 + (residual / self.noise) ** 2)
         curve = self.weight / root / self.noise**2
         down = -((curve * residual).astype(np.float32) @ changes).astype(np.float64)
         bend = np.einsum("ks,ks,k->s", changes, changes, curve.astype(np.float32)) + 1e-9
-        strength = np.clip(down / bend, 0, 1)
-        return strength * down - 0.5 * strength**2 * bend
+        return np.clip(down / bend, 0, 1), down, bend
 
 
 def _log_lit(darkness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -169,10 +169,9 @@ class Scenery:
             without = lit.residual(others @ rest, besides)
             gain = float(lit.gains(changes[:, [k]], without)[0]) if strength[k] > FAINT else 0.0
             there = replace(lit, weight=lit.weight * (np.abs(changes[:, k]) * strength[k] > TOLD * lit.noise))
-            before, after, usual = there.loss(without), there.loss(left), there.usual_loss
-            share = float(np.clip((before - after) / max(before - usual, 1e-12), 0, 1))
             # lights that take more than all light are none
-            found.append((gain / max(chance, 1e-12), share / max(1.0, float(strength.sum()))))
+            share = there.share(without, left) / max(1.0, float(strength.sum()))
+            found.append((gain / max(chance, 1e-12), share))
         return np.array(found)
 
 
@@ -189,12 +188,29 @@ def search(scenery: Scenery) -> tuple[list[Light], np.ndarray]:
     own = lit.changes(shadows)
     moved = [scenery.occluder.moved(x, y) for x, y in places_elsewhere(float(max(scenery.occluder.size[:2])))]
     bright = [own, *parallel_map(lambda m: lit.changes(cast(m)), moved)]
-    found: list[int] = []
-    for _ in range(MOST):
-        strength, besides = lit.fit(shadows[:, found])
-        residual = lit.residual(shadows[:, found] @ strength, besides)
-        found.append(int(lit.gains(own, residual).argmax()))
-    lights, settled = [lobes[k] for k in found], False
+
+    def first(fitting: bool) -> list[Light]:
+        """One by one those that explain most, or explain much and fit."""
+        found: list[int] = []
+        for _ in range(MOST):
+            strength, besides = lit.fit(shadows[:, found])
+            residual = lit.residual(shadows[:, found] @ strength, besides)
+            scores = lit.gains(own, residual)
+            if fitting:
+                chance = max(parallel_map(lambda by: float(lit.gains(by, -residual).max()), bright))
+                scores = np.minimum(scores / (EARNS * chance), lit.shares(own, residual, TOLD) / FITS)
+            found.append(int(scores.argmax()))
+        return [lobes[k] for k in found]
+
+    lights, told = _kept(scenery, first(False), bright)
+    if not lights and told[0] > EARNS:  # a long faint shadow may explain most, but little of what is uneven there
+        lights, told = _kept(scenery, first(True), bright)
+    return lights, told
+
+
+def _kept(scenery: Scenery, lights: Sequence[Light], bright: Sequence[np.ndarray]) -> tuple[list[Light], np.ndarray]:
+    """Those lights that speak for themselves beside the others, settled; see search."""
+    lights, settled = list(lights), False
     while True:
         told = scenery.told(lights, bright)
         scores = (told / [EARNS, FITS]).min(1) if settled else told[:, 0]
