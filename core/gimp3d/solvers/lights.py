@@ -154,7 +154,6 @@ class Shading:
     def shares(self, changes: np.ndarray, residual: np.ndarray, told: float) -> np.ndarray:
         """[S]: what share of the loss, noise left out, each of more shadows would explain at its best strength, about,
         where it makes differences `told` times as large as they usually are."""
-
         strengths, *_ = self._best(changes, residual)
 
         def of(k: int) -> float:

@@ -34,6 +34,7 @@ ELSEWHERE = 8  # other places of the object, which tell what chance explains
 ASIDE = 1.1  # widths of the object from its place to those
 EARNS = 1.8  # times what chance explains that a light must explain: those that are there 2.4 to 12, others up to 1.4
 FITS = 0.52  # share of what is uneven where its shadow falls that a light must explain
+STARTS = False, True  # a long faint shadow may explain most, but little of what is uneven there: then those that fit
 TOLD = 0.25  # of what a difference usually is, from which a shadow changes it
 FAINT = 0.03  # share of light below which nothing is a shadow
 
@@ -149,6 +150,10 @@ class Scenery:
                 step, rounds = step / 2, 0
         return lights
 
+    def most(self, tried: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+        """What the best of all shadows explains, given what they change, [K, S], and what is left, [K]; above 0."""
+        return max(1e-12, *parallel_map(lambda by: float(self.lit.gains(*by).max()), tried))
+
     def told(self, lights: Sequence[Light], bright: Sequence[np.ndarray]) -> np.ndarray:
         """[L, 2] what speaks for each light beside the others: what it explains over what chance does, and what share
         of what is uneven where its shadow falls, texture left out. `bright`: changes that shapes make, first the
@@ -160,8 +165,7 @@ class Scenery:
         changes = lit.changes(shadows)
         strength, besides = lit.fit(shadows)
         left = lit.residual(shadows @ strength, besides)
-        tried = [(bright[0], left), *((b, -left) for b in bright)]
-        chance = max(parallel_map(lambda by: float(lit.gains(*by).max()), tried))
+        chance = self.most([(bright[0], left), *((b, -left) for b in bright)])
         found = []
         for k in range(len(lights)):
             others = np.delete(shadows, k, axis=1)
@@ -171,7 +175,7 @@ class Scenery:
             there = replace(lit, weight=lit.weight * (np.abs(changes[:, k]) * strength[k] > TOLD * lit.noise))
             # lights that take more than all light are none
             share = there.share(without, left) / max(1.0, float(strength.sum()))
-            found.append((gain / max(chance, 1e-12), share))
+            found.append((gain / chance, share))
         return np.array(found)
 
 
@@ -190,21 +194,22 @@ def search(scenery: Scenery) -> tuple[list[Light], np.ndarray]:
     bright = [own, *parallel_map(lambda m: lit.changes(cast(m)), moved)]
 
     def first(fitting: bool) -> list[Light]:
-        """One by one those that explain most, or explain much and fit."""
+        """One by one those that explain most, or that explain much and fit."""
         found: list[int] = []
         for _ in range(MOST):
             strength, besides = lit.fit(shadows[:, found])
             residual = lit.residual(shadows[:, found] @ strength, besides)
             scores = lit.gains(own, residual)
             if fitting:
-                chance = max(parallel_map(lambda by: float(lit.gains(by, -residual).max()), bright))
+                chance = scenery.most([(b, -residual) for b in bright])
                 scores = np.minimum(scores / (EARNS * chance), lit.shares(own, residual, TOLD) / FITS)
             found.append(int(scores.argmax()))
         return [lobes[k] for k in found]
 
-    lights, told = _kept(scenery, first(False), bright)
-    if not lights and told[0] > EARNS:  # a long faint shadow may explain most, but little of what is uneven there
-        lights, told = _kept(scenery, first(True), bright)
+    for fitting in STARTS:
+        lights, told = _kept(scenery, first(fitting), bright)
+        if lights or told[0] <= EARNS:
+            break
     return lights, told
 
 

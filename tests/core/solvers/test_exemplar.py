@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from structured import edge_error, structured
@@ -55,3 +56,21 @@ def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
         fills.append(done[hole])
     assert (fills[0] == fills[1]).all()
     assert edge_error(np.where(hole[..., None], done, truth), truth, hole) < 2
+
+
+@pytest.mark.parametrize("radius", [30, 45])
+def test_loose_texture_keeps_much_of_its_contrast(radius: int) -> None:
+    """Nothing tells where blades of grass lie: patches that agree on none of them must not end as a smooth spot."""
+    size, kept = 240, []
+    y, x = np.indices((size, size)) - size // 2
+    hole, inside = x**2 + y**2 < radius**2, x**2 + y**2 < (radius - 6) ** 2
+    for seed in range(3):
+        rng, lawn = np.random.default_rng(seed), np.full((size, size, 3), (120, 130, 90), np.uint8)
+        for _ in range(1600):
+            root, way, length = rng.uniform(0, size, 2), rng.normal(-0.7, 0.35), rng.uniform(4, 11)
+            tip = root + length * np.array([np.cos(way), np.sin(way)])
+            colour = rng.uniform((50, 90, 40), (150, 200, 90)).astype(int).tolist()
+            cv2.line(lawn, root.astype(int).tolist(), tip.astype(int).tolist(), colour, 1, cv2.LINE_AA)
+        done = complete_picture(lawn, hole)[0].mean(-1)
+        kept.append(done[inside].std() / lawn.mean(-1)[~hole].std())
+    assert np.mean(kept) > 0.5, kept

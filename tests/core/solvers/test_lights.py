@@ -84,6 +84,16 @@ def test_the_candidate_that_was_cast_gains_most() -> None:
     assert lit.gains(lit.changes(shapes), -residual)[5] == 0.0  # brightness is no shadow
 
 
+def test_what_was_cast_explains_what_is_uneven_and_a_longer_shadow_of_the_kind_less() -> None:
+    rng = np.random.default_rng(6)
+    long = np.maximum(blot(24, 30, 6), np.maximum(blot(38, 30, 6), blot(52, 30, 6)))
+    shapes = np.stack([blot(24, 30, 6).ravel(), long.ravel(), blot(50, 52, 6).ravel()], -1)
+    lit = Shading.make([painted(0.4 * shapes[:, 0].reshape(SIZE, SIZE), rng)], LEVELS)
+    _, besides = lit.fit(shapes[:, :0])
+    cast, longer, elsewhere = lit.shares(lit.changes(shapes), lit.residual(np.zeros(SIZE * SIZE), besides), 0.25)
+    assert cast > 0.8 > longer > elsewhere
+
+
 @given(st.integers(0, 2**31), st.integers(1, 60))
 def test_hardly_known_surfaces_are_no_error(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

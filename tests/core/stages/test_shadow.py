@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
 from gimp3d.pipeline import PRESETS, RemovalResult, RemovalSettings, View, remove_object, render_bytes
 from gimp3d.srgb import decoded, encoded, linear
+from gimp3d.stages import light_search
 from gimp3d.stages.charts import Chart, Plane
 from gimp3d.stages.light_search import Light
 from gimp3d.stages.shadow import Shadow, find_contact
@@ -82,6 +84,27 @@ def test_the_light_is_found_and_its_shadow_goes(name: str) -> None:
     assert abs((result.shadow["lights"][0]["azimuth"] - scene.lamps[0].azimuth + 180) % 360 - 180) < 14
     before, after = darkening(scene, result)
     assert before < -0.3 and abs(after) < 0.2 * abs(before)
+
+
+@pytest.mark.parametrize("over_chance", [3.0, 1.0])
+def test_where_the_light_that_explains_most_does_not_fit_those_that_fit_are_tried(
+    over_chance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, starts, kept = made("tiles"), [], light_search._kept
+
+    def at_first_none(
+        scenery: Scenery, lights: list[Light], bright: list[np.ndarray]
+    ) -> tuple[list[Light], np.ndarray]:
+        starts.append(lights)
+        return ([], np.array([over_chance, 0.2])) if len(starts) == 1 else kept(scenery, lights, bright)
+
+    monkeypatch.setattr(light_search, "_kept", at_first_none)
+    shadow = remove_object(scene.gaussians, views(scene), scene.region, PRESETS["draft"]).shadow
+    if over_chance < light_search.EARNS:  # nothing is there: no need to look again
+        assert len(starts) == 1 and not shadow["found"]
+        return
+    assert len(starts) == 2 and shadow["found"], shadow["reason"]
+    assert np.degrees(np.arccos(np.dot(shadow["lights"][0]["direction"], scene.lamps[0].direction))) < 10
 
 
 @pytest.mark.parametrize("paint", [plain, pytest.param(tiles, marks=pytest.mark.slow)])
