@@ -92,11 +92,9 @@ def test_where_the_light_that_explains_most_does_not_fit_those_that_fit_are_trie
 ) -> None:
     scene, starts, kept = made("tiles"), [], light_search._kept
 
-    def at_first_none(
-        scenery: Scenery, lights: list[Light], bright: list[np.ndarray]
-    ) -> tuple[list[Light], np.ndarray]:
-        starts.append(lights)
-        return ([], np.array([over_chance, 0.2])) if len(starts) == 1 else kept(scenery, lights, bright)
+    def at_first_none(*given: Any) -> tuple[list[Light], np.ndarray]:
+        starts.append(given)
+        return ([], np.array([over_chance, 0.2])) if len(starts) == 1 else kept(*given)
 
     monkeypatch.setattr(light_search, "_kept", at_first_none)
     shadow = remove_object(scene.gaussians, views(scene), scene.region, PRESETS["draft"]).shadow
