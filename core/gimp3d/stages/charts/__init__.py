@@ -21,6 +21,7 @@ from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
 from .find import (
+    HEIGHT,
     TELLING,
     TOLERANCE,
     ChartSettings,
@@ -31,6 +32,7 @@ from .find import (
     lay_surface,
     pixel_density,
     pixel_size,
+    places_drawn,
 )
 from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
@@ -76,8 +78,14 @@ def chart_number(reference: str | None) -> int | None:
 def lay_planes(
     planes: Sequence[Plane], witnesses: Sequence[Witness], region: Region, settings: ChartSettings = ChartSettings()
 ) -> tuple[Laid, ...]:
-    """Where the surfaces at the planes lie; those of which the object hides nothing are left out."""
-    textures, flats = Textures.make(witnesses), (_placed(p, region, witnesses, settings.largest) for p in planes)
+    """Where the surfaces at the planes lie; those of which the object hides nothing are left out.
+
+    On a ball the plane lies below the surface where the object stands, out of sight: if that hides nothing of any
+    plane, it may of what is drawn over it.
+    """
+    textures, flats = Textures.make(witnesses), [_placed(p, region, witnesses, settings.largest) for p in planes]
+    if not any(flats):
+        flats = [_placed(p, region, witnesses, settings.largest, drawn=True) for p in planes]
     laid = (lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None)
     return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
 
@@ -192,15 +200,23 @@ def _chart(
     return chart, shown.spread
 
 
-def _placed(plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float) -> Surface | None:
-    """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high.
+def _placed(
+    plane: Plane, region: Region, witnesses: Sequence[Witness], largest: float, drawn: bool = False
+) -> Surface | None:
+    """What the object hides of a plane and a margin to fill it from, at most `largest` texels wide and high; `drawn`:
+    of the surface that views draw over it.
 
     None if the object hides nothing of it, or no view faces what it hides. What few pixels of the views look at, such
     as a plane's far end, is left out rather than to show the rest with less detail than photos.
     """
     diagonal = extent(region)
-    x, y = grid(2 * diagonal, PLACES)
-    places = plane.points(x, y).reshape(-1, 3)
+    if drawn:
+        places = places_drawn(plane, 2 * diagonal, PLACES, witnesses, HEIGHT * diagonal)
+        x, y = np.moveaxis(plane.local(places)[..., :2], -1, 0)
+    else:
+        x, y = grid(2 * diagonal, PLACES)
+        places = plane.points(x, y)
+    places = places.reshape(-1, 3)
     said = ask(witnesses, places, TOLERANCE)
     hole = _unseen(said.reshape(-1, *x.shape))
     labels, _ = scipy.ndimage.label(hole)

@@ -332,8 +332,7 @@ def lay_surface(
     offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough)
     if known.sum() < TELLING:
         return level
-    completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
-    relief = at(cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR), "relief")
+    relief = at(_completed(offset, known, flat), "relief")
     # near splats cover far ones, so all seem to stand higher: trained ones lie as much lower, and so must new ones
     near = offset[known & (np.abs(offset) < SINKS * diagonal)]
     sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
@@ -342,6 +341,21 @@ def lay_surface(
         reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
         noise=float(np.median(np.abs(offset[known]))),
     )
+
+
+def places_drawn(plane: Plane, half: float, count: int, witnesses: Sequence[Witness], height: float) -> np.ndarray:
+    """[count, count, 3] places on what views draw no higher than so much over a square of a plane, completed."""
+    flat = flat_surface(plane, plane.origin, np.full(2, 2 * half), 2 * half / count)
+    offset, known = _drawn_surface(flat, witnesses, height, math.inf)
+    if known.sum() < TELLING:
+        return flat.points()
+    return replace(flat, depth=flat.depth + _completed(offset, known, flat)).points()
+
+
+def _completed(offset: np.ndarray, known: np.ndarray, flat: Surface) -> np.ndarray:
+    """[H, W] float32: offsets, see _drawn_surface, smoothly where they are not known."""
+    completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
+    return cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _drawn_surface(
