@@ -23,6 +23,7 @@ from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.exemplar import EDGE
+from gimp3d.stages.charts import grid
 from gimp3d.stages.witness import Says
 
 from .command import kept, parser_of, say, told_in_one_line, write
@@ -90,6 +91,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
+    "what the object hides lies on planes": (
+        ("gimp3d.stages.charts:places_drawn", lambda plane, half, count, *_: plane.points(*grid(half, count))),
+    ),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
     "surfaces too close for rough depths are all there": (
         ("gimp3d.stages.charts:_parted", lambda drawn, _: [chart for chart, _ in drawn]),

@@ -52,6 +52,13 @@ def block_reach(origin: np.ndarray, rays: np.ndarray, grow: float = 0.0) -> np.n
     return np.where((near < far) & (near > 0), near, np.inf)
 
 
+def ball_reach(origin: np.ndarray, rays: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """The same for a ball."""
+    a, b = (rays**2).sum(-1), rays @ (origin - centre)
+    root = b**2 - a * (((origin - centre) ** 2).sum() - radius**2)
+    return np.where((root > 0) & (b < 0), (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
+
+
 @dataclass(frozen=True)
 class Room:
     """Views of surfaces that the block hides."""
@@ -66,6 +73,7 @@ def room(
     colours: Callable[[np.ndarray], np.ndarray] = texture,
     block: bool = True,
     front: float = -np.inf,  # y where the first plane ends
+    ball: float | None = None,  # radius of one below the block, which touches its top
 ) -> Room:
     """Photos and depth maps, the latter with relative noise."""
     rng = np.random.default_rng(5)
@@ -77,6 +85,8 @@ def room(
         with np.errstate(invalid="ignore"):
             reach[0][camera.centre[1] + reach[0] * rays[..., 1] < front] = np.inf
         surface = reach.min(0)
+        if ball is not None:
+            surface = np.minimum(surface, ball_reach(camera.centre, rays, np.array([0, 0, -ball]), ball))
         object_at = block_reach(camera.centre, rays) if block else np.full(shape, np.inf)
         z = np.minimum(surface, object_at)
         shown = np.isfinite(z)
@@ -294,6 +304,19 @@ def test_a_chart_shows_the_floor_and_nothing_in_its_hole(floor_room: Room, floor
 def test_a_surface_that_nothing_hides_has_no_chart(floor_room: Room) -> None:
     clear = [replace(w, hidden=np.zeros_like(w.hidden)) for w in floor_room.witnesses]
     assert charts_of([Plane.make(np.zeros(3), UP, REGION)], clear) == ()
+
+
+def test_what_the_object_hides_of_a_ball_is_found_though_the_plane_lies_below_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    foot, radius = 0.1, 1.0
+    monkeypatch.setitem(globals(), "BLOCK", (np.array([-foot, -foot, -0.02]), np.array([foot, foot, 0.5])))
+    witnesses = room(EYES, [(UP, -2 * radius)], ball=radius).witnesses
+    (chart,) = charts_of([Plane.make(np.array([0, 0, -0.08]), UP, REGION)], witnesses)
+    hole = texels(chart)[chart.hole.ravel()]
+    assert chart.kind == "relief" and np.abs(hole[:, :2]).max() < foot + 0.03
+    assert len(hole) > 0.8 * (2 * foot) ** 2 * (chart.camera.fx / chart.depth[0, 0]) ** 2
+    assert np.abs(np.linalg.norm(hole - np.array([0, 0, -radius]), axis=1) - radius).max() < 0.005
 
 
 def area(chart: Chart, mask: np.ndarray) -> float:
