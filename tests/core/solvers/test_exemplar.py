@@ -58,10 +58,9 @@ def test_what_is_unknown_beside_the_hole_has_no_say() -> None:
     assert edge_error(np.where(hole[..., None], done, truth), truth, hole) < 2
 
 
-@pytest.mark.parametrize("radius", [30, 45])
-def test_loose_texture_keeps_much_of_its_contrast(radius: int) -> None:
+def test_loose_texture_keeps_much_of_its_contrast() -> None:
     """Nothing tells where blades of grass lie: patches that agree on none of them must not end as a smooth spot."""
-    size, kept = 240, []
+    size, radius, kept = 240, 45, list[float]()
     y, x = np.indices((size, size)) - size // 2
     hole, inside = x**2 + y**2 < radius**2, x**2 + y**2 < (radius - 6) ** 2
     for seed in range(3):
@@ -73,4 +72,4 @@ def test_loose_texture_keeps_much_of_its_contrast(radius: int) -> None:
             cv2.line(lawn, root.astype(int).tolist(), tip.astype(int).tolist(), colour, 1, cv2.LINE_AA)
         done = complete_picture(lawn, hole)[0].mean(-1)
         kept.append(done[inside].std() / lawn.mean(-1)[~hole].std())
-    assert np.mean(kept) > 0.5, kept
+    assert np.mean(kept) > 0.53, kept  # 0.49 where all patches that overlap have much the same say
