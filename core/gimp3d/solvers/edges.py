@@ -22,7 +22,8 @@ from .regularity import pattern_search, turn_of
 SIDE = 192  # px: pictures are shrunk to this to look for edges
 ANGLE = 2.0  # degrees between directions that are tried
 REACH, LEAST = 40, 12  # known px on either side of the hole that tell an edge: at most, at least
-FURTHEST = 3  # times REACH, from the hole, where they lie at most
+SOON = 24  # or at most so many, if it is told on one side only: it may end soon, as at a corner
+FURTHEST = 120  # px from the hole, where they lie at most
 TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
 HALF_TELLS = 8.0  # where it is told on one side only: among all lines noise alone comes to 7
 STEEP = 4.0  # grey levels that it must be
@@ -31,10 +32,10 @@ LIKE = 0.7  # cosine between the steps on both sides
 ROWS = np.array([-6, -5, -4, -2, -1, 1, 2, 4, 5, 6])  # px across an edge
 FAR_ABOVE, ABOVE, BELOW, FAR_BELOW = slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)
 SHARP = 0.5  # share of the step between what is further from it that it must be: else it is a slope
-BLOCKS, CLOSEST = 5, 3  # that what tells it on either side is cut into, and how many of them it must reach through
+BLOCK = 8  # known px along it: its length is told by so many at a time …
+CLOSEST = 3  # … and it must reach through the blocks next to the hole
 STEADY = 0.5  # share of the usual step that it is in each
 CLOSE = 4  # px beyond the hole, with the colours on both sides of an edge, that tell that it runs on to there
-BLOCK = 8  # px, in each of which it is that further off, as far as it goes
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
 MOST = 8  # edges of a part of the hole
@@ -53,23 +54,24 @@ class Edge:
     mean: np.ndarray  # [3] grey levels, of what lies to its left and right
 
 
-def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[Edge, ...]:
+def find_edges(image: np.ndarray, hole: np.ndarray, known: np.ndarray, sure: np.ndarray) -> tuple[Edge, ...]:
     """The edges that run into each part of a picture's hole on one side and go on, alike, on the other.
 
-    The picture is [H, W, 3] uint8; hole and what it shows well, `known`, are [H, W] bool.
+    The picture is [H, W, 3] uint8; hole, what it shows, `known`, and what it shows well, `sure`, are [H, W] bool: only
+    the latter tells that an edge ends.
     """
     count, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
     found: list[Edge] = []
     for part in range(1, count):
         if parts[part, cv2.CC_STAT_AREA] >= LEAST_HOLE:
-            found += _of_part(image, labels == part, known)
+            found += _of_part(image, labels == part, known, sure & known)
     return tuple(found)
 
 
-def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edge]:
-    near = bounds(hole, FURTHEST * REACH)
+def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray, sure: np.ndarray) -> list[Edge]:
+    near = bounds(hole, FURTHEST)
     corner = np.array([near[1].start, near[0].start])
-    picture, hole, known = image[near].astype(np.float32), hole[near], known[near]
+    picture, hole, known, sure = image[near].astype(np.float32), hole[near], known[near], sure[near]
     scale = min(1.0, SIDE / max(hole.shape))
     size = tuple(max(1, round(n * scale)) for n in hole.shape[::-1])
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
@@ -93,7 +95,7 @@ def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[Edg
         edge = None
         if cut.max() - cut.min() >= LEAST_CUT * scale:
             place = ((offset * across + middle) + 0.5) / scale - 0.5
-            edge = _settled(picture, known, hole, angles[k], place, side)
+            edge = _settled(picture, (known, sure), hole, angles[k], place, side)
         if edge is not None:
             found.append(edge)
         ways = (cut.min(), along), (cut.max(), -along)
@@ -170,16 +172,17 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
     sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], axis=1)  # [rows, side + 1, 7]
     number = np.arange(len(rows))
     begins, ends = open_.argmax(1), side - open_[:, ::-1].argmax(1)
-    reach, far = REACH * scale, round(FURTHEST * REACH * scale)
-    counts = sums[..., 0]
-    first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
-    last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
-    whole = np.zeros((2, side, 7))  # of the two sides
-    whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - far)]
-    whole[1, rows] = sums[number, np.minimum(last, ends + far)] - sums[number, ends]
-    pairs = np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1)
-    both, *halves = (_told(told, 2 * LEAST * scale) for told in (pairs, pairs[:1], pairs[1:]))
-    return np.stack([both, *(np.where(half >= HALF_TELLS, half, 0.0) for half in halves)])
+    counts, far, pairs = sums[..., 0], round(FURTHEST * scale), []
+    for reach in (REACH * scale, SOON * scale):
+        first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
+        last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
+        whole = np.zeros((2, side, 7))  # of the two sides
+        whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - far)]
+        whole[1, rows] = sums[number, np.minimum(last, ends + far)] - sums[number, ends]
+        pairs.append(np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1))
+    least = 2 * LEAST * scale
+    halves = np.max([[_told(told[k : k + 1], least) for k in (0, 1)] for told in pairs], axis=0)
+    return np.concatenate([_told(pairs[0], least)[None], np.where(halves >= HALF_TELLS, halves, 0.0)])
 
 
 def _told(sums: np.ndarray, least: float) -> np.ndarray:
@@ -200,14 +203,20 @@ def _told(sums: np.ndarray, least: float) -> np.ndarray:
 
 
 def _settled(
-    picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, place: np.ndarray, side: int
+    picture: np.ndarray,
+    shown: tuple[np.ndarray, np.ndarray],  # [H, W] bool: what may tell an edge, and what may tell that it ends
+    hole: np.ndarray,
+    angle: float,
+    place: np.ndarray,
+    side: int,
 ) -> Edge | _Half | None:
     """The edge at full resolution: turned and shifted to where it is told best."""
     rows, cols = np.nonzero(hole)
     pixels = np.stack([cols, rows], 1).astype(np.float64)
-    shows = known.astype(np.float32)
+    known, sure = (a.astype(np.float32) for a in shown)
     outset = turn_of(-angle)[0]
     heart = place + ((pixels - place) @ outset).mean() * outset
+    tells = [side in (BOTH, number) for number in (BEFORE, AFTER)]
 
     def at(values: np.ndarray) -> tuple[float, Edge | _Half | None]:
         along, across = turn_of(-angle - values[0])
@@ -215,33 +224,34 @@ def _settled(
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
         if not len(cut):
             return 0.0, None
-        sides, ends, steady, told_by, beyond = [], [], True, np.zeros(0), np.zeros(0)
-        for number, (start, step) in enumerate(((cut.min() - 1, -1), (cut.max() + 1, 1))):
-            t = start + step * np.arange(FURTHEST * REACH)
+        ways = [start + step * np.arange(FURTHEST) for start, step in ((cut.min() - 1, -1), (cut.max() + 1, 1))]
+        lines = []  # what lies beside it on either side of the hole
+        for t, tell in zip(ways, tells):
             grid = origin + t[None, :, None] * along + ROWS[:, None, None] * across
             x, y = np.ascontiguousarray(grid.transpose(2, 0, 1), np.float32)
-            there = cv2.remap(shows, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[..., None] > 0.999
+            shows = cv2.remap(known if tell else sure, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            sums = np.concatenate([np.ones_like(colours[..., :1]), colours, colours**2], -1) * there
-            near = sums * (there.cumsum(1) <= REACH)
-            if side not in (BOTH, BEFORE + number):
-                beyond = near
-                ends.append(start)
-                continue
-            told_by = near
-            sides.append([near[rows].sum((0, 1)) for rows in (ABOVE, BELOW)])
-            steady = steady and _is_edge(near, border=side != BOTH)
-            ends.append(float(t[_length(sums, _step(near))]))
-        pairs = np.array(sides)
-        told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
-        edge = Edge(origin, along, (ends[0], ends[1]), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
-        if not steady or side == BOTH:
-            return told, edge if steady else None
-        inwards = 1 if side == BEFORE else -1
-        enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
-        seen = _goes_on(beyond[:, :CLOSE], told_by)
-        dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-        return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
+            lines.append(np.dstack([np.ones_like(shows), colours, colours**2]) * (shows[..., None] > 0.999))
+
+        def within(reach: int) -> tuple[float, Edge | _Half | None]:
+            near = [line * (line[..., :1].cumsum(1) <= reach) for line in lines]
+            telling = [line for line, tell in zip(near, tells) if tell]
+            pairs = np.array([[line[rows].sum((0, 1)) for rows in (ABOVE, BELOW)] for line in telling])
+            told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
+            if not all(_is_edge(line, border=side != BOTH) for line in telling):
+                return told, None
+            lengths = [_length(line, _step(by)) if tell else 0 for line, by, tell in zip(lines, near, tells)]
+            first, last = (float(t[n]) for t, n in zip(ways, lengths))
+            edge = Edge(origin, along, (first, last), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
+            if side == BOTH:
+                return told, edge
+            inwards, beyond = (1, near[1]) if side == BEFORE else (-1, near[0])
+            enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
+            seen = _goes_on(beyond[:, :CLOSE], telling[0])
+            dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
+            return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
+
+        return max((within(reach) for reach in (REACH, SOON)[: 1 + (side != BOTH)]), key=lambda told: told[0])
 
     best, found = pattern_search(at, np.eye(2))
     return found if best > 0 else None
@@ -263,11 +273,11 @@ def _is_edge(sums: np.ndarray, border: bool) -> bool:
     As a border, it must part two regions: a thin line, or one of a texture's, has the same colours further off again.
     """
     pixels = sums[..., 0].sum(0).cumsum()
-    block = np.minimum((BLOCKS * pixels / max(pixels[-1], 1)).astype(int), BLOCKS - 1)
+    block = (CLOSEST * pixels / max(1, min(pixels[-1], CLOSEST * BLOCK * len(ROWS)))).astype(int)
     whole = _step(sums)
     size = max(float(np.linalg.norm(whole)), 1e-9)
-    each = np.array([_step(sums[:, block == k]) for k in range(BLOCKS)]) @ whole / size
-    far, near = _step(sums, FAR_ABOVE, FAR_BELOW) @ whole, each[:CLOSEST]
+    near = np.array([_step(sums[:, block == k]) for k in range(CLOSEST)]) @ whole / size
+    far = _step(sums, FAR_ABOVE, FAR_BELOW) @ whole
     parts = not border or far >= STEADY * (whole @ whole)
     return bool(parts and size**2 >= SHARP * far and near.min() >= STEADY * np.median(near))
 

@@ -75,7 +75,7 @@ def complete_picture(
     if (regular == hole).all():
         return np.where(hole[..., None], image, given), max(m.misfit for m in motions)
     # where photos disagree a little, what they show tells edges all the same
-    edges = find_edges(given, asked, ~asked & given.any(-1))
+    edges = find_edges(given, asked, ~asked & given.any(-1), known)
     done = _by_patches(image, hole & ~regular, unknown, edges, patch, seed)
     if done is None:
         return given.copy(), float("nan")

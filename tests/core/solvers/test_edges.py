@@ -23,7 +23,7 @@ def textured(picture: np.ndarray, grain: float, size: float = 1.5, seed: int = 0
 
 
 def found(picture: np.ndarray, hole: np.ndarray = HOLE):  # type: ignore[no-untyped-def]
-    return find_edges(np.where(hole[..., None], np.uint8(0), picture), hole, ~hole)
+    return find_edges(np.where(hole[..., None], np.uint8(0), picture), hole, ~hole, ~hole)
 
 
 def side_of(angle: float, offset: float) -> np.ndarray:
@@ -50,7 +50,7 @@ def test_a_line_is_an_edge_and_a_stripe_two(half_width: float, edges: int) -> No
 def test_what_hides_some_of_an_edge_is_looked_past() -> None:
     picture, beside = textured(np.where(side_of(30, 0) > 0, 150.0, 100.0), 12), np.hypot(X - 40, Y - 23) < 18
     picture[beside] = 0
-    assert len(find_edges(picture, HOLE, ~HOLE & ~beside)) == 1
+    assert len(find_edges(picture, HOLE, ~HOLE & ~beside, ~HOLE & ~beside)) == 1
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_two_edges_that_are_told_on_one_side_each_meet_in_a_corner(turned: int, 
 
 def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
     picture, known = textured(np.where(side_of(0, 3) > 0, 150.0, 100.0), 8), ~HOLE & (X < 25)
-    edges = find_edges(np.where(known[..., None], picture, np.uint8(0)), HOLE, known)
+    edges = find_edges(np.where(known[..., None], picture, np.uint8(0)), HOLE, known, known)
     assert len(edges) == 1 and edges[0].origin[0] + edges[0].along[0] * max(edges[0].ends) > MIDDLE + 25
 
 
