@@ -117,7 +117,7 @@ def _by_patches(
     if levels[-1][1].all():
         return None
     field: NearestNeighbourField | None = None
-    expected = expect(image / np.float32(255), hole, ~(hole | unknown))
+    expected = expect(image / np.float32(255), hole, ~(hole | unknown), edges)
     for finer, (channels, open_) in reversed([*enumerate(levels)]):
         barred = cv2.resize(unknown.astype(np.float32), open_.shape[::-1], interpolation=cv2.INTER_AREA) > 0
         smooth = expected.sized(open_.shape, radius | 1)  # half a patch: single pixels' would leave no texture

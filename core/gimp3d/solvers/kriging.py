@@ -8,12 +8,14 @@ the variogram tells how far the truth may lie from them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from ..geometry import bounds
+from .edges import Edge
 
 SIDE = 64  # px: the hole and what is given round it are shrunk to this
 GIVEN, TELLING = 0.3, 2.0  # of the hole's thickness: how far known pixels are given, and tell the covariance
@@ -40,10 +42,10 @@ class Expected(NamedTuple):
         return Expected(*(cv2.blur(a, (patch,) * 2) for a in resized))
 
 
-def expect(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> Expected:
+def expect(image: np.ndarray, hole: np.ndarray, known: np.ndarray, edges: Sequence[Edge] = ()) -> Expected:
     """A picture [H, W, 3] in [0, 1] at the size that tells the hole's: detail finer than `SIDE` allows is left out.
 
-    Hole and what is known are [H, W] bool, some of it each.
+    Hole and what is known are [H, W] bool, some of it each. What edges part has a mean of its own on either side.
     """
     height, width = hole.shape
     thickness = 2 * float(cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5).max())
@@ -64,9 +66,35 @@ def expect(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> Expected:
         near = there & (away <= begins + max(LEAST_GIVEN, TELLING * thickness * scale))
         given = there & (away <= begins + max(LEAST_GIVEN, reach * scale))
         window = bounds(near | unknown)
-        picture[unknown], variance[unknown] = _kriged(*(a[window] for a in (picture, unknown, given, near)))
+        mean = _means(picture, unknown, given, near, edges, scale)
+        parts = (a[window] for a in (picture - mean, unknown, given, near))
+        deviations, variance[unknown] = _kriged(*parts)
+        picture[unknown] = mean[unknown] + deviations
     colours, variance = (cv2.resize(a, (width, height), interpolation=cv2.INTER_LINEAR) for a in (picture, variance))
     return Expected(colours, np.where(known, 0, variance))
+
+
+def _means(
+    picture: np.ndarray, unknown: np.ndarray, given: np.ndarray, near: np.ndarray, edges: Sequence[Edge], scale: float
+) -> np.ndarray:
+    """[h, w, 3]: of what is near, on this side of the edges that cut the hole and what is given round it."""
+    mean = np.broadcast_to(picture[near].mean(0, dtype=np.float64), picture.shape).copy()
+    parts = (unknown | given).astype(np.uint8)
+    for edge in edges:
+        ends = ((edge.origin + t * edge.along + 0.5) * scale - 0.5 for t in edge.ends)
+        first, last = (tuple(int(v) for v in np.rint(end)) for end in ends)
+        cv2.line(parts, first, last, 0)
+    count, labels = cv2.connectedComponents(parts, connectivity=4)
+    if count > 2:
+        _, nearest = cv2.distanceTransformWithLabels(1 - parts, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        of = np.zeros(nearest.max() + 1, labels.dtype)
+        of[nearest[parts > 0]] = labels[parts > 0]
+        labels = of[nearest]
+        for label in range(1, count):
+            of_label = given & (labels == label)
+            if of_label.any():
+                mean[labels == label] = picture[of_label].mean(0, dtype=np.float64)
+    return mean
 
 
 def _kriged(
@@ -75,8 +103,7 @@ def _kriged(
     """Means [N, 3] and variances [N] of the unknown pixels; the covariance is of what is near."""
     import scipy.linalg  # slow to import, and many removals fill no picture
 
-    mean = picture[near].mean(0, dtype=np.float64)
-    deviations = np.where(near[..., None], picture - mean, 0)
+    deviations = np.where(near[..., None], picture, 0)
     twice = 2 * near.shape[0], 2 * near.shape[1]  # so that nothing wraps round
     # divided by all pixels, not by the pairs at a lag, it is a covariance: no combination has a negative variance
     spectrum = (np.abs(np.fft.rfft2(deviations, twice, axes=(0, 1))) ** 2).sum(-1)
@@ -91,8 +118,8 @@ def _kriged(
     system = between(places, places) + NUGGET * max(own, ROUNDING) * np.eye(len(places))
     lower = scipy.linalg.cholesky(system, lower=True, overwrite_a=True)
     across = scipy.linalg.solve_triangular(lower, between(places, wanted), lower=True)
-    values = scipy.linalg.solve_triangular(lower, picture[given] - mean, lower=True)
-    found, variance = mean + across.T @ values, np.maximum(own - (across**2).sum(0), 0)
+    values = scipy.linalg.solve_triangular(lower, picture[given], lower=True)
+    found, variance = across.T @ values, np.maximum(own - (across**2).sum(0), 0)
     return ROUNDING * np.rint(found / ROUNDING), ROUNDING**2 * np.rint(variance / ROUNDING**2)
 
 
