@@ -99,6 +99,20 @@ def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
     assert len(edges) == 1 and edges[0].origin[0] + edges[0].along[0] * max(edges[0].ends) > MIDDLE + 25
 
 
+@pytest.mark.parametrize("agreed", [True, False])
+def test_a_mat_whose_corner_is_near_goes_on_to_what_photos_disagree_on(agreed: bool) -> None:
+    """Its border is told by 22 px; beyond the hole stands something else, and only where that is sure the mat ends."""
+    picture = textured(np.where((X > 3) & (Y < 52), 150.0, 100.0), 6)
+    clutter = (Y < -20) & (X < 35)
+    picture[clutter] = np.random.default_rng(0).integers(1, 255, (clutter.sum(), 1))
+    shown = np.where(HOLE[..., None], np.uint8(0), picture)
+    edges = find_edges(shown, HOLE, ~HOLE, ~HOLE & (agreed | ~clutter))
+    assert len(edges) == (not agreed)
+    for edge in edges:
+        ends = np.array([edge.origin + t * edge.along - MIDDLE for t in edge.ends])
+        assert np.abs(ends[:, 0] - 3).max() < 6 and ends[:, 1].min() < -28 and 45 < ends[:, 1].max() < 60
+
+
 @pytest.mark.parametrize(("gap", "goes_on"), [(5, True), (0, False)])
 def test_an_edge_goes_on_to_a_corner_right_beyond_the_hole(gap: int, goes_on: bool) -> None:
     """A chessboard's: on the hole's other side the next squares soon begin."""

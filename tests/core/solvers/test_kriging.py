@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
+import cv2
 import numpy as np
 import pytest
 
 from gimp3d.solvers import kriging
+from gimp3d.solvers.edges import Edge
 from gimp3d.solvers.kriging import carried, expect, foretell, variogram
 
 SIDE = 56
@@ -45,6 +49,19 @@ def test_it_is_the_best_linear_guess_of_a_stationary_texture() -> None:
     # how far `near` reaches is told by OpenCV's chamfer distance, which is off by a few per cent
     assert np.abs(found.colours[hole] - guess).max() < 0.02 < 0.5 * picture[hole].std()
     np.testing.assert_allclose(found.variance[hole], table[0, 0] - (weights * across).sum(1), rtol=0.1)
+
+
+def test_what_an_edge_parts_has_a_mean_of_its_own_on_either_side() -> None:
+    """A border that runs into the hole and on to where nothing is known."""
+    grain = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, (SIDE, SIDE)), (0, 0), 1)
+    picture = grey(np.where(X + 0.3 * Y > 35, 0.8, 0.3) + 0.03 * grain / grain.std())
+    known = ~HOLE & (Y > 20)
+    along = np.array([-0.3, 1.0]) / math.hypot(0.3, 1)
+    edge = Edge(np.array([27.5, 25.0]), along, (-25.0, 35.0), np.full(3, 127.0), np.full(3, 140.0))
+    shown, clear = np.where(known[..., None], picture, 0), HOLE & (np.abs(X + 0.3 * Y - 35) > 2)
+    found = [expect(shown, HOLE, known, edges).colours for edges in ((edge,), ())]
+    with_edge, without = (np.sqrt(((colours - picture)[clear] ** 2).mean()) for colours in found)
+    assert with_edge < 0.5 * without
 
 
 @pytest.mark.parametrize("period", [9.0, 14.0])
