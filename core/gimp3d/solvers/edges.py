@@ -11,6 +11,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from .regularity import pattern_search, turn_of
 SIDE = 192  # px: pictures are shrunk to this to look for edges
 ANGLE = 2.0  # degrees between directions that are tried
 REACH, LEAST = 40, 12  # known px on either side of the hole that tell an edge: at most, at least
-SOON = 24  # or at most so many, if it is told on one side only: it may end soon, as at a corner
+SOON = 24  # or so many, of one that is told on one side only and not so far: it may end soon, as at a corner
 FURTHEST = 120  # px from the hole, where they lie at most
 TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
 HALF_TELLS = 8.0  # where it is told on one side only: among all lines noise alone comes to 7
@@ -172,17 +173,18 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
     sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], axis=1)  # [rows, side + 1, 7]
     number = np.arange(len(rows))
     begins, ends = open_.argmax(1), side - open_[:, ::-1].argmax(1)
-    counts, far, pairs = sums[..., 0], round(FURTHEST * scale), []
+    counts, furthest, pairs = sums[..., 0], round(FURTHEST * scale), []
     for reach in (REACH * scale, SOON * scale):
         first = (counts < (counts[number, begins] - reach)[:, None]).sum(1)
         last = (counts <= (counts[number, ends] + reach)[:, None]).sum(1) - 1
         whole = np.zeros((2, side, 7))  # of the two sides
-        whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - far)]
-        whole[1, rows] = sums[number, np.minimum(last, ends + far)] - sums[number, ends]
+        whole[0, rows] = sums[number, begins] - sums[number, np.maximum(first, begins - furthest)]
+        whole[1, rows] = sums[number, np.minimum(last, ends + furthest)] - sums[number, ends]
         pairs.append(np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1))
     least = 2 * LEAST * scale
-    halves = np.max([[_told(told[k : k + 1], least) for k in (0, 1)] for told in pairs], axis=0)
-    return np.concatenate([_told(pairs[0], least)[None], np.where(halves >= HALF_TELLS, halves, 0.0)])
+    far, soon = (np.array([_told(told[k : k + 1], least) for k in (0, 1)]) for told in pairs)
+    halves = np.where(far >= HALF_TELLS, far, np.where(soon >= HALF_TELLS, soon, 0.0))
+    return np.concatenate([_told(pairs[0], least)[None], halves])
 
 
 def _told(sums: np.ndarray, least: float) -> np.ndarray:
@@ -218,7 +220,7 @@ def _settled(
     heart = place + ((pixels - place) @ outset).mean() * outset
     tells = [side in (BOTH, number) for number in (BEFORE, AFTER)]
 
-    def at(values: np.ndarray) -> tuple[float, Edge | _Half | None]:
+    def at(values: np.ndarray, reach: int) -> tuple[float, Edge | _Half | None]:
         along, across = turn_of(-angle - values[0])
         origin = heart + values[1] * across
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
@@ -233,28 +235,28 @@ def _settled(
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             lines.append(np.dstack([np.ones_like(shows), colours, colours**2]) * (shows[..., None] > 0.999))
 
-        def within(reach: int) -> tuple[float, Edge | _Half | None]:
-            near = [line * (line[..., :1].cumsum(1) <= reach) for line in lines]
-            telling = [line for line, tell in zip(near, tells) if tell]
-            pairs = np.array([[line[rows].sum((0, 1)) for rows in (ABOVE, BELOW)] for line in telling])
-            told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
-            if not all(_is_edge(line, border=side != BOTH) for line in telling):
-                return told, None
-            lengths = [_length(line, _step(by)) if tell else 0 for line, by, tell in zip(lines, near, tells)]
-            first, last = (float(t[n]) for t, n in zip(ways, lengths))
-            edge = Edge(origin, along, (first, last), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
-            if side == BOTH:
-                return told, edge
-            inwards, beyond = (1, near[1]) if side == BEFORE else (-1, near[0])
-            enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
-            seen = _goes_on(beyond[:, :CLOSE], telling[0])
-            dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-            return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
+        near = [line * (line[..., :1].cumsum(1) <= reach) for line in lines]
+        telling = [line for line, tell in zip(near, tells) if tell]
+        pairs = np.array([[line[rows].sum((0, 1)) for rows in (ABOVE, BELOW)] for line in telling])
+        told, means = float(_told(pairs[:, :, None], 2 * LEAST)[0]), pairs[..., 1:4] / np.maximum(pairs[..., :1], 1)
+        if not all(_is_edge(line, border=side != BOTH) for line in telling):
+            return told, None
+        lengths = [_length(line, _step(by)) if tell else 0 for line, by, tell in zip(lines, near, tells)]
+        first, last = (float(t[n]) for t, n in zip(ways, lengths))
+        edge = Edge(origin, along, (first, last), np.diff(means, axis=1).mean((0, 1)), means.mean((0, 1)))
+        if side == BOTH:
+            return told, edge
+        inwards, beyond = (1, near[1]) if side == BEFORE else (-1, near[0])
+        enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
+        seen = _goes_on(beyond[:, :CLOSE], telling[0])
+        dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
+        return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
 
-        return max((within(reach) for reach in (REACH, SOON)[: 1 + (side != BOTH)]), key=lambda told: told[0])
-
-    best, found = pattern_search(at, np.eye(2))
-    return found if best > 0 else None
+    for reach in (REACH, SOON)[: 1 + (side != BOTH)]:
+        told, found = pattern_search(partial(at, reach=reach), np.eye(2))
+        if found is not None and told >= (TELLS if side == BOTH else HALF_TELLS):
+            return found
+    return None
 
 
 def _mean(sums: np.ndarray) -> np.ndarray:
