@@ -22,6 +22,7 @@ import numpy as np
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
+from gimp3d.solvers.edges import REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.charts import grid
 from gimp3d.stages.witness import Says
@@ -128,6 +129,13 @@ RULES: dict[str, tuple[Switch, ...]] = {
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
     "no edge turns a corner, nor ends unseen": (("gimp3d.solvers.edges:_joined", lambda *_: []),),
+    "an edge is told as far as others, or not": (("gimp3d.solvers.edges:SOON", REACH),),
+    "what photos disagree on ends edges": (
+        ("gimp3d.solvers.exemplar:find_edges", Around(lambda find: lambda *p: find(*p[:3], p[2]))),
+    ),
+    "one mean on both sides of an edge": (
+        ("gimp3d.solvers.kriging:_means", Around(lambda means: lambda *p: means(*p[:4], (), p[5]))),
+    ),
     "no edge is continued": (("gimp3d.solvers.exemplar:find_edges", lambda *_: ()),),
     "edges of all kinds are alike": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[0] * 6])),),
     "edges of one step are": (("gimp3d.solvers.exemplar:GUIDE", np.float32([EDGE, EDGE, *[1] * 3, *[0] * 3])),),
