@@ -14,7 +14,7 @@ from ..gaussians import Gaussians
 from ..geometry import dilated, framed, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
-from .charts import Chart, Hits, Laid, extent, first_hits
+from .charts import INLIER, Chart, Hits, Laid, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
 from .witness import AGREEING, Witness, total_over
@@ -135,9 +135,11 @@ def clear_air(
         index, *at, z = framed(chart.camera, means)
         above, texels = chart.depth[tuple(at)] - z, tuple(at)
         low = np.abs(above) < LOW * extent(region)
-        fates[rows[index[low & chart.rests[texels]]]] = Fate.REMOVED_REVEALED
-        gone[index] |= low & stand_on_hole(chart, texels, above)
+        gone[index] |= low & (chart.rests[texels] | stand_on_hole(chart, texels, above))
         known[index] |= low & chart.known[texels]
+    for plane in {id(p): p for chart in charts for p in chart.others}.values():
+        if all(plane is not chart.plane for chart in charts):  # the object hides nothing of it
+            known |= np.abs(plane.local(means)[:, 2]) < INLIER * extent(region)
     fates[rows[gone & ~known]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 

@@ -22,6 +22,7 @@ from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
 from .find import (
     HEIGHT,
+    MOST_SCATTER,
     TELLING,
     TOLERANCE,
     ChartSettings,
@@ -34,6 +35,7 @@ from .find import (
     pixel_size,
     places_drawn,
 )
+from .find import INLIER as INLIER
 from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
 from .plane import Hits as Hits
@@ -86,8 +88,12 @@ def lay_planes(
     textures, flats = Textures.make(witnesses), [_placed(p, region, witnesses, settings.largest) for p in planes]
     if not any(flats):
         flats = [_placed(p, region, witnesses, settings.largest, drawn=True) for p in planes]
-    laid = (lay_surface(flat, region, witnesses, textures, settings) for flat in flats if flat is not None)
-    return tuple(replace(one, others=tuple(p for p in planes if one.plane.crosses(p))) for one in laid)
+
+    def laid(flat: Surface) -> Laid:
+        others = tuple(p for p in planes if flat.plane.crosses(p))
+        return lay_surface(flat, region, witnesses, textures, settings, others=others)
+
+    return tuple(laid(flat) for flat in flats if flat is not None)
 
 
 def draw_charts(
@@ -177,9 +183,11 @@ def _chart(
     """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
     points, shape = laid.points(), laid.depth.shape
     texels = points.reshape(-1, 3)
-    scatter = depth_scatter(_before(texels, laid.others), witnesses)
+    told, scatter = _told(laid), depth_scatter(_before(texels, laid.others), witnesses)
+    if scatter == MOST_SCATTER:  # most of it is another surface
+        scatter = depth_scatter(points[told], witnesses)
     tolerance = max(TOLERANCE, scatter)
-    shown = _shown(points, laid.plane, witnesses, tolerance)
+    shown = _shown(points, laid.plane, witnesses, tolerance, told)
     colours = _object_colours(laid.plane, witnesses, tolerance)
     inside, filled = in_region(region, texels).reshape(shape), _marked(texels, witnesses, marked).reshape(shape)
     below, rests, foreign = _told_by_colours(shown, colours, inside, filled)
@@ -251,10 +259,15 @@ def _quantiles(there: np.ndarray, weight: np.ndarray, share: float) -> np.ndarra
     return there[order[k, [0, 1]], [0, 1]]
 
 
-def _shown(points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float) -> _Shown:
-    """What photos show at points [H, W, 3] of a surface."""
+def _shown(
+    points: np.ndarray, plane: Plane, witnesses: Sequence[Witness], tolerance: float, told: np.ndarray
+) -> _Shown:
+    """What photos show at points [H, W, 3] of a surface; it is what hangs together with texels that led to it [H, W]
+    bool, and does not begin anew where it goes through another one."""
     said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
     there = shown_there(said)
+    parts, _ = scipy.ndimage.label(there)
+    there &= np.isin(parts, parts[told])
     hole = _unseen(said) & there
     image, spread, loud = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
@@ -370,6 +383,15 @@ def _before(surface: np.ndarray, others: Sequence[Plane]) -> np.ndarray:
     """
     before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
     return surface[before] if before.sum() > TELLING else surface
+
+
+def _told(laid: Laid) -> np.ndarray:
+    """[H, W] bool: texels at the pixels that led to the plane; all if they are few, or not known."""
+    told = np.zeros(laid.depth.shape, bool)
+    if laid.plane.told is not None:
+        _, rows, cols, _ = framed(laid.camera, laid.plane.told[np.isfinite(laid.plane.told).all(1)])
+        told[rows, cols] = True
+    return told if told.sum() > TELLING else np.ones_like(told)
 
 
 def _unseen(said: np.ndarray) -> np.ndarray:

@@ -151,7 +151,7 @@ def find_planes(
     for _, plane, claim in found:
         before = max((textures.agreement(claim.own.on(p)) for p in planes), default=0.0)
         if not planes or 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
-            planes.append(plane)
+            planes.append(replace(plane, told=claim.own.some(SURFACE).on(plane)))
     return tuple(planes)
 
 
@@ -320,16 +320,17 @@ def lay_surface(
     textures: Textures,
     settings: ChartSettings = ChartSettings(),
     enough: float = math.inf,  # points that tell where a few texels lie, where views show more
+    others: Sequence[Plane] = (),  # that it may meet
 ) -> Laid:
     """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
 
     def at(offset: np.ndarray | float, kind: str) -> Laid:
-        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, np.nan, (), "")
+        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, np.nan, others, "")
         agreement = textures.agreement(laid.points().reshape(-1, 3))
         return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
 
     level, diagonal = at(0.0, "plane"), extent(region)
-    offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough)
+    offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough, others, INLIER * diagonal)
     if known.sum() < TELLING:
         return level
     relief = at(_completed(offset, known, flat), "relief")
@@ -359,10 +360,17 @@ def _completed(offset: np.ndarray, known: np.ndarray, flat: Surface) -> np.ndarr
 
 
 def _drawn_surface(
-    flat: Surface, witnesses: Sequence[Witness], height: float, enough: float
+    flat: Surface,
+    witnesses: Sequence[Witness],
+    height: float,
+    enough: float,
+    others: Sequence[Plane] = (),
+    on_others: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """z of what views draw no higher than so much over a plane less the plane's, in cells of a few texels, and where
     that is known. Both [h, w]; the median over the views' points.
+
+    Points that lie within a distance on another plane, and nearer to it than to this one, tell of that.
     """
     camera, away = flat.camera, flat.depth[0, 0]
     h, w = -(-camera.height // CELL), -(-camera.width // CELL)
@@ -377,7 +385,12 @@ def _drawn_surface(
         side = CELL * away / camera.fx * view.camera.fx / z_there if z_there > 0 else 1  # of a cell, in px
         step = max(1, int(side * math.sqrt(len(witnesses) / enough)))
         points = surface_points(view.camera, view.depth_beside, window, step)[2]
-        points = points[np.abs(flat.plane.local(points)[:, 2]) < height]
+        off = np.abs(flat.plane.local(points)[:, 2])
+        own = off < height
+        for other in others:
+            beside = np.abs(other.local(points)[:, 2])
+            own &= (beside > on_others) | (beside > off)
+        points = points[own]
         _, rows, cols, z = framed(camera, points)
         # sorted as one number: the cell, then z, whose bits are in order as it is positive
         return (rows // CELL * w + cols // CELL).astype(np.uint64) << 32 | z.astype(np.float32).view(np.uint32)

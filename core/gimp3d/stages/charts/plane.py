@@ -28,6 +28,7 @@ class Plane:
     right: np.ndarray
     down: np.ndarray
     normal: np.ndarray  # unit, towards the cameras
+    told: np.ndarray | None = None  # [N, 3] places on it that views show, if it was found
 
     @classmethod
     def make(cls, point: np.ndarray, normal: np.ndarray, region: Region) -> Plane:
