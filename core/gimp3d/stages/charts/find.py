@@ -320,7 +320,7 @@ def lay_surface(
     textures: Textures,
     settings: ChartSettings = ChartSettings(),
     enough: float = math.inf,  # points that tell where a few texels lie, where views show more
-    others: Sequence[Plane] = (),  # that it may meet
+    others: tuple[Plane, ...] = (),  # that it may meet
 ) -> Laid:
     """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
 
