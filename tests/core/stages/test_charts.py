@@ -241,6 +241,52 @@ def test_few_photos_do_not_judge_a_plane(count: int) -> None:
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1))
 
 
+ACROSS = (
+    np.array([0.0, -0.5, 0.7]) / np.hypot(0.5, 0.7),
+    0.15 / np.hypot(0.5, 0.7),
+)  # meets FLOOR at y −0.3, WALL at z 0.5
+
+
+def crossing(told: np.ndarray | None) -> tuple[Plane, tuple[Plane, ...], Room]:
+    """A plane that rough depths make up across a corner, the floor and the wall there, and views of them."""
+    normal, offset = ACROSS
+    plane = replace(Plane.make(offset * normal, normal, REGION), told=told)
+    others = tuple(Plane.make(o * n, n, REGION) for n, o in (FLOOR, WALL))
+    return plane, others, room(front_cameras(LOW), [FLOOR, WALL])
+
+
+def test_a_relief_is_of_what_lies_on_no_other_plane() -> None:
+    plane, others, seen = crossing(None)
+    flat = stage._placed(plane, REGION, seen.witnesses, 200)
+    assert flat is not None
+    textures = Textures.make(seen.witnesses)
+    away = [
+        np.abs(find.lay_surface(flat, REGION, seen.witnesses, textures, others=o).depth - flat.depth).max()
+        for o in ((), others)
+    ]
+    assert away[0] > 0.1 * extent(REGION) and away[1] < 0.03 * extent(REGION)
+
+
+def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> None:
+    """Pixels at the wall led to the plane: how far depths scatter is asked there, and it ends before the floor."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 60), np.linspace(0.36, 0.4, 9)))
+    at_wall = np.stack([x, y, (y + 0.3) / 1.4], -1)
+    there, tolerance = {}, {}
+    for told in (None, at_wall):
+        plane, _, seen = crossing(told)
+        flat = stage._placed(plane, REGION, seen.witnesses, 200)
+        assert flat is not None
+        laid = find.Laid(flat.plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
+        chart, _ = stage._chart(laid, REGION, seen.witnesses, ())
+        points = texels(chart).reshape(*chart.depth.shape, 3)
+        on_floor = np.abs(points[..., 2]) < 0.01
+        on_wall = np.abs(points[..., 1] - 0.4) < 0.01
+        there[told is None] = chart.there[on_floor].mean(), chart.there[on_wall].mean()
+        tolerance[told is None] = chart.tolerance
+    assert there[True][0] > 0.9 and there[False][0] == 0 and there[False][1] > 0.5
+    assert tolerance[False] < 0.5 * tolerance[True]
+
+
 def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(floor_room: Room) -> None:
     floor = Plane.make(np.zeros(3), UP, REGION)
     guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)

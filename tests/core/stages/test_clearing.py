@@ -130,6 +130,9 @@ def test_rests_on_texels_that_show_the_object_go(charts: tuple[Chart, ...]) -> N
     new = set(cleared(given, charts=(replace(chart, rests=rests, known=chart.known & ~rests),))) - before
     low, high, elsewhere = range(len(given.scene) - 3, len(given.scene))
     assert low in new and high not in new and elsewhere not in new
+    wall = Plane.make(np.array([*beside, 0.0]), np.array([-1.0, 0, 0]), REGION)  # of which the object hides nothing
+    at_wall = replace(chart, rests=rests, known=chart.known & ~rests, others=(wall,))
+    assert low not in cleared(given, charts=(at_wall,))
     x, y = given.scene.means[sorted(new), :2].T
     assert np.abs([x - beside[0], y - beside[1]]).max() < 0.1
 
