@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 
 .PHONY: setup demo test test-all test-blenders test-painters lint bench bench-raster bench-poisson \
 	bench-ablation bench-propagate bench-inpaint bench-fill bench-fill-rules bench-pareto bench-stability \
-	bench-large bench-real bench-boxes bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean
+	bench-large bench-real bench-boxes bench-light bench-light-rules bench-faults fuzz extension screenshots by-mouse clean scenes
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -75,6 +75,10 @@ bench-propagate: $(READY)
 # every preset on real scenes, with the true picture and without, and the paper's: an hour or more, so not part of bench
 bench-real: $(READY)
 	$(BIN)/python -m benchmarks.real $(DATA)
+
+# eight further scenes with truth, rendered and trained: three quarters of an hour; then e.g. make bench-ablation DATA=build/made
+scenes: $(READY)
+	$(BIN)/python tools/make_scenes.py
 
 # removals in boxes that other users would draw: half an hour, goes on where it stopped
 bench-boxes: $(READY)

@@ -96,6 +96,14 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts:places_drawn", lambda plane, half, count, *_: plane.points(*grid(half, count))),
     ),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
+    "what lies on other planes tells of a relief, too": (
+        ("gimp3d.stages.charts.find:_drawn_surface", Around(lambda drawn: lambda *p: drawn(*p[:4]))),
+    ),
+    "depths of another surface tell how they scatter": (("gimp3d.stages.charts:MOST_SCATTER", -1.0),),
+    "a surface begins anew where it goes through another": (
+        ("gimp3d.stages.charts:_shown", Around(lambda shown: lambda *p: shown(*p[:4], np.ones_like(p[4])))),
+    ),
+    "only charts hold what stands low on a hole": (("gimp3d.stages.clearing:INLIER", 0.0),),
     "surfaces too close for rough depths are all there": (
         ("gimp3d.stages.charts:_parted", lambda drawn, _: [chart for chart, _ in drawn]),
     ),

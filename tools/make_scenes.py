@@ -275,7 +275,7 @@ def tiles() -> Made:
         solid("cylinder", (0.05, 0.86, 0.95), (0.5, 0.5, 0.02), paint("plain", 1.0, "#f2ede0"), tilt=math.pi / 2),
         solid("cube", (0.05, 0.84, 1.02), (0.03, 0.02, 0.2), paint("plain", 1.0, "#202020")),
     ]
-    region = Box.make([0.05, 0.93, 0.95], [0.7, 0.2, 0.7])
+    region = Box.make([0.05, 0.93, 0.95], [0.7, 0.22, 0.7])
     return Made(parts, region, (0.05, 0.95, 0.9), 2.4, (0, 38), (-140, -40))
 
 
@@ -381,7 +381,7 @@ def shown_by_any(points: np.ndarray, views: list[tuple[Camera, np.ndarray, np.nd
     seen = np.zeros(len(points), bool)
     for camera, depth, mask in views:
         uv, z = camera.project(points)
-        inside = (z > 0) & (uv >= 0).all(1) & (uv < SIZE).all(1)
+        inside = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
         x, y = np.where(inside[:, None], uv, 0).astype(int).T
         seen |= inside & ~mask[y, x] & (np.abs(depth[y, x] - z) < 0.01 * z)
     return seen
