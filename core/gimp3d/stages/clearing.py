@@ -117,7 +117,7 @@ def clear_air(
 
     A photo shows a Gaussian by a share of what that draws in the emptied scene: not what lies where the object is, and
     it does not tell what is right beside that. Low on its rests stands nothing but the object, nor on a hole, unless
-    another surface is known there; surface that reaches below a hole stays if some photo shows it.
+    another surface is known there, or whole; surface that reaches below a hole stays if some photo shows it.
     """
     stays, near = ~selection.removed, scene.usable & near_region(scene, region, 1.0)
     kept, rows, fates = scene.take(stays), np.flatnonzero(stays & near), selection.fates.copy()
