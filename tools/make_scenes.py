@@ -2,9 +2,10 @@
 
     python tools/make_scenes.py [NAME …] [--out build/made]
 
-Each takes about five minutes on 2 cores, is the same every time and a folder as `gimp3d bench` reads it: training
-photos with the object, test views without, masks of what the object hides and of what no training view sees of that,
-and splats that were trained on the photos from what their depths show. All benchmarks take the folder as DATA.
+Each takes about six minutes on 2 cores, is the same every time (but for rare single grey levels, as Cycles rounds) and
+a folder as `gimp3d bench` reads it: training photos with the object, test views without, masks of what the object hides
+and of what no training view sees of that, and splats that were trained on the photos from what their depths show. All
+benchmarks take the folder as DATA.
 """
 
 from __future__ import annotations
@@ -62,7 +63,6 @@ class Made:
 def paint(kind: str, scale: float, *colours: str, stretch: tuple[float, ...] = (1, 1, 1), rough: float = 0.8):
     """A material: a texture node's value, in metres times `scale`, to colours '#rrggbb' at even steps."""
     material = bpy.data.materials.new(kind)
-    material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
     shader = nodes["Principled BSDF"]
     shader.inputs["Roughness"].default_value = rough
@@ -126,7 +126,6 @@ def lit(sky: float, sun: float, angle: float = 3.0) -> None:
     """Light from all sides, and a lamp high on the left."""
     world = bpy.data.worlds.new("sky")
     bpy.context.scene.world = world
-    world.use_nodes = True
     world.node_tree.nodes["Background"].inputs["Color"].default_value = rgba("#cfdbe8")
     world.node_tree.nodes["Background"].inputs["Strength"].default_value = sky
     lamp = bpy.data.lights.new("sun", "SUN")
@@ -333,7 +332,6 @@ class Studio:
         for one in made.thing if not made.casts else ():
             one.visible_shadow = one.visible_diffuse = one.visible_glossy = one.visible_transmission = False
         self.z = bpy.data.materials.new("z")
-        self.z.use_nodes = True
         nodes, links = self.z.node_tree.nodes, self.z.node_tree.links
         seen, glow = nodes.new("ShaderNodeCameraData"), nodes.new("ShaderNodeEmission")
         links.new(seen.outputs["View Z Depth"], glow.inputs["Color"])
