@@ -25,11 +25,13 @@ import bpy
 import cv2
 import mathutils
 import numpy as np
+from bpy.types import Material, Object
 from scipy.spatial import cKDTree
 
 from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.gaussians import SH_C0, Gaussians
+from gimp3d.geometry import sees
 from gimp3d.io.cameras import write_transforms
 from gimp3d.io.images import read_image, write_png
 from gimp3d.io.ply import write_gaussians
@@ -48,7 +50,7 @@ FAR = 60.0  # m, where nothing is
 class Made:
     """What is built, and from where it is seen."""
 
-    thing: list[bpy.types.Object]  # what is removed
+    thing: list[Object]  # what is removed
     region: Box
     target: tuple[float, float, float]
     distance: float
@@ -60,7 +62,9 @@ class Made:
 # ------------------------------------------------------------------------------------------------------------ building
 
 
-def paint(kind: str, scale: float, *colours: str, stretch: tuple[float, ...] = (1, 1, 1), rough: float = 0.8):
+def paint(
+    kind: str, scale: float, *colours: str, stretch: tuple[float, ...] = (1, 1, 1), rough: float = 0.8
+) -> Material:
     """A material: a texture node's value, in metres times `scale`, to colours '#rrggbb' at even steps."""
     material = bpy.data.materials.new(kind)
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -105,10 +109,12 @@ def rgba(colour: str) -> tuple[float, ...]:
     return (*np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4), 1.0)
 
 
-def solid(shape: str, at: Iterable[float], size: Iterable[float], material, turn: float = 0.0, tilt: float = 0.0):
+def solid(
+    shape: str, at: Iterable[float], size: Iterable[float], material: Material, turn: float = 0.0, tilt: float = 0.0
+) -> Object:
     """A cube, cylinder, ball (uv_sphere) or cone, `size` its edges; textures are in metres."""
-    make = getattr(bpy.ops.mesh, f"primitive_{shape}_add")
-    make(**({"size": 1.0} if shape == "cube" else {"radius1": 0.5, "depth": 1} if shape == "cone" else {"radius": 0.5}))
+    unit = {"cube": {"size": 1.0}, "cone": {"radius1": 0.5, "depth": 1.0}}.get(shape, {"radius": 0.5})
+    getattr(bpy.ops.mesh, f"primitive_{shape}_add")(**unit)
     made = bpy.context.object
     if shape == "cylinder":
         made.scale = (1, 1, 0.5)
@@ -135,7 +141,8 @@ def lit(sky: float, sun: float, angle: float = 3.0) -> None:
     bpy.context.collection.objects.link(held)
 
 
-def wood(light: str = "#b98a5a", dark: str = "#6d4526"):
+def wood(light: str = "#b98a5a", dark: str = "#6d4526") -> Material:
+    """Wavy planks along x."""
     return paint("Wave", 5.0, dark, light, dark, light, stretch=(0.25, 2.0, 1.0))
 
 
@@ -376,13 +383,7 @@ class Studio:
 
 def shown_by_any(points: np.ndarray, views: list[tuple[Camera, np.ndarray, np.ndarray]]) -> np.ndarray:
     """[N] bool: points [N, 3] that a view sees past the object: camera, depth without it, and where it is [H, W]."""
-    seen = np.zeros(len(points), bool)
-    for camera, depth, mask in views:
-        uv, z = camera.project(points)
-        inside = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
-        x, y = np.where(inside[:, None], uv, 0).astype(int).T
-        seen |= inside & ~mask[y, x] & (np.abs(depth[y, x] - z) < 0.01 * z)
-    return seen
+    return np.any([sees(camera, np.where(mask, 0, depth), points, 0.01) for camera, depth, mask in views], axis=0)
 
 
 def make(name: str, folder: Path) -> None:

@@ -137,9 +137,9 @@ def clear_air(
         low = np.abs(above) < LOW * extent(region)
         gone[index] |= low & (chart.rests[texels] | stand_on_hole(chart, texels, above))
         known[index] |= low & chart.known[texels]
-    for plane in {id(p): p for chart in charts for p in chart.others}.values():
-        if all(plane is not chart.plane for chart in charts):  # the object hides nothing of it
-            known |= np.abs(plane.local(means)[:, 2]) < INLIER * extent(region)
+        for plane in chart.others:
+            if all(plane is not c.plane for c in charts):  # the object hides nothing of it
+                known |= np.abs(plane.local(means)[:, 2]) < INLIER * extent(region)
     fates[rows[gone & ~known]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
