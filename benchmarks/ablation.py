@@ -121,9 +121,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
-    "light differs by as much all round the hole": (("gimp3d.stages.propagate:TOLERANCES", (1.0,)),),
+    "light differs by as much all round the hole": (("gimp3d.stages.propagate.blend:TOLERANCES", (1.0,)),),
     "the fill is as sharp as photos": (("gimp3d.stages.propagate.detail:BLURS", ()),),
-    "depth seams do not stop the blend": (("gimp3d.stages.propagate:SEAM", 1e9),),
+    "the fill keeps the colours of its reference": (("gimp3d.stages.propagate.blend:TELLING", 1e9),),
+    "depth seams do not stop the blend": (("gimp3d.stages.propagate.blend:SEAM", 1e9),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),
     "colours as seeded": (("seed.corrections", 0),),

@@ -7,16 +7,10 @@ import threading
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
-import scipy.sparse
-import scipy.sparse.linalg
-from hypothesis import given
-from hypothesis import strategies as st
-from property_tests import examples
 from scenes import cameras, truth
 
 from gimp3d.camera import Camera
@@ -24,7 +18,6 @@ from gimp3d.compute.threads import set_thread_count
 from gimp3d.errors import BadInput
 from gimp3d.pipeline import render_bytes
 from gimp3d.raster import render
-from gimp3d.stages import propagate as stage
 from gimp3d.stages.propagate import (
     PaintedView,
     PropagateSettings,
@@ -32,8 +25,6 @@ from gimp3d.stages.propagate import (
     Reference,
     Rule,
     ViewToPaint,
-    blend_band,
-    blend_rim,
     near_hole,
     paper,
     propagate,
@@ -403,136 +394,3 @@ def test_a_part_is_pasted_where_it_belongs() -> None:
     assert changed == [[3, 2], [4, 1]] and not picture.any()
     assert part.pasted(picture, part.raw).max() == 5
     assert part.rule_map()[3:5, 1:3].tolist() == rules.tolist() and part.rule_map().sum() == rules.sum()
-
-
-def seam(rows: int = 30, cols: int = 40) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A far wall on the left, a near thing on the right: base, depth, and a hole over both."""
-    base = np.full((rows, cols, 3), 100, np.uint8)
-    base[:, cols // 2 :] = 250
-    depth = np.full((rows, cols), 4.0, np.float32)
-    depth[:, cols // 2 :] = 2.0
-    painted = np.zeros((rows, cols), bool)
-    painted[8:22, 8:32] = True
-    return base, depth, painted
-
-
-def test_the_papers_blend_takes_no_boundary_across_a_depth_seam() -> None:
-    base, depth, painted = seam()
-    painted[:, 20:] = False
-    raw = np.full((*painted.shape, 3), 60.0, np.float32)
-    blended = blend_rim(base, raw, painted, np.zeros_like(painted), depth)
-    assert (blended[painted] == 100).all() and (blended[~painted] == base[~painted]).all()
-
-
-def test_the_blend_corrects_each_side_of_a_depth_seam_by_its_own_photo() -> None:
-    base, depth, painted = seam()
-    raw = np.where(depth[..., None] > 3, 60.0, 240.0) * np.ones(3, np.float32)
-    blended = blend_band(base, raw, painted, ~painted, 6.0, depth)
-    assert (blended[painted] == base[painted]).all() and (blended[~painted] == base[~painted]).all()
-    flat = blend_band(base, raw, painted, ~painted, 6.0, np.ones_like(depth))
-    assert np.abs(flat[painted].astype(int) - base[painted]).max() > 5
-
-
-def test_what_the_fill_does_not_touch_has_no_say() -> None:
-    """Specks of photo between seams: a maze of them would make the solution slow, and worse where it counts."""
-    rng = np.random.default_rng(0)
-    base, raw = rng.integers(0, 256, (60, 80, 3)).astype(np.uint8), rng.uniform(0, 255, (60, 80, 3)).astype(np.float32)
-    painted, band = np.zeros((2, 60, 80), bool)
-    painted[20:40, 20:40] = True
-    band[15:45, 15:45] = ~painted[15:45, 15:45]
-    alone = blend_band(base, raw, painted, band, 6.0, np.where(painted | band, 1.0, 0.0))
-    specks = np.zeros_like(band)
-    specks[:, 50::2] = rng.random((60, 15)) < 0.7
-    depth = np.where(painted | band | specks, 1.0, 0.0)
-    assert (blend_band(base, raw, painted, band | specks, 6.0, depth) == alone).all()
-
-
-def test_a_part_without_photo_keeps_its_colours() -> None:
-    base, depth, painted = seam()
-    raw = np.full((*painted.shape, 3), 60.0, np.float32)
-    assert (blend_band(base, raw, painted, np.zeros_like(painted), 6.0, depth)[painted] == 60).all()
-
-
-def solved_directly(domain: np.ndarray, weight: np.ndarray, anchor: np.ndarray) -> np.ndarray:
-    """Screened Poisson without guidance by a sparse factor in double precision, [N, 3]."""
-    index = np.full(domain.shape, -1)
-    index[domain] = np.arange(domain.sum())
-    links = []
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        both = domain[a] & domain[b]
-        links.append(np.stack([index[a][both], index[b][both]]))
-    i, j = np.concatenate(links, 1)
-    graph = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (int(domain.sum()),) * 2)
-    graph = graph + graph.T
-    matrix = scipy.sparse.diags(np.asarray(graph.sum(1)).ravel() + weight[domain]) - graph
-    return scipy.sparse.linalg.spsolve(matrix.tocsc(), (weight[..., None] * anchor)[domain]).reshape(-1, 3)
-
-
-@examples(15)
-@given(seed=st.integers(0, 10_000), width=st.floats(1.0, 20.0))
-def test_the_blend_is_exact_to_a_grey_level(seed: int, width: float) -> None:
-    rng = np.random.default_rng(seed)
-    h, w = rng.integers(12, 50, 2)
-    base = rng.integers(0, 256, (h, w, 3)).astype(np.uint8)
-    raw = (base + rng.normal(0, 30, 3) + rng.normal(0, 10, base.shape)).astype(np.float32)
-    painted = np.zeros((h, w), bool)
-    painted[h // 4 : 3 * h // 4, w // 4 : 3 * w // 4] = rng.random((3 * h // 4 - h // 4, 3 * w // 4 - w // 4)) < 0.95
-    band = ~painted & (rng.random((h, w)) < 0.8)
-    with mock.patch.object(stage, "solve_poisson", wraps=stage.solve_poisson) as solver:
-        blended = blend_band(base, raw, painted, band, width, np.ones((h, w)))
-    (domain, *_), system = solver.call_args
-    assert (domain == (stage.cv2.distanceTransform((~painted).astype(np.uint8), 2, 5) <= stage.FAR * width)).all()
-    correction = np.zeros(base.shape)
-    correction[domain] = solved_directly(domain, system["weight"], system["anchor"])
-    expected = np.clip(np.rint(raw + correction), 0, 255)
-    assert np.abs(blended[painted].astype(int) - expected[painted]).max() <= 1
-    assert (blended[~painted] == base[~painted]).all()
-
-
-def test_what_few_pixels_of_photo_say_fades_with_the_distance() -> None:
-    base = np.full((40, 120, 3), 100, np.uint8)
-    raw = np.full(base.shape, 60.0, np.float32)
-    painted = np.ones((40, 120), bool)
-    painted[:, :2] = False
-    band = np.zeros_like(painted)
-    band[19:21, 1] = True  # a hundredth of the hole's outline
-    blended = blend_band(base, raw, painted, band, 4.0, np.ones((40, 120)))
-    assert blended[20, 2, 0] > 70 and blended[20, 115, 0] < 66
-
-
-def test_photo_that_shows_something_else_does_not_colour_the_fill() -> None:
-    base = np.full((60, 60, 3), 120, np.uint8)
-    raw = np.full(base.shape, 100.0, np.float32) + np.random.default_rng(0).normal(0, 2, base.shape).astype(np.float32)
-    painted = np.zeros((60, 60), bool)
-    painted[20:40, 20:40] = True
-    other = np.zeros_like(painted)
-    other[18:42, 42:50] = True  # a blue thing that stands elsewhere in the reference's picture
-    raw[other] = [20, 30, 180]
-    blended = blend_band(base, raw, painted, ~painted, 3.0, np.ones((60, 60)))
-    assert np.abs(blended[painted].mean(0) - 120).max() < 2
-
-
-def test_each_side_of_the_hole_has_its_own_light() -> None:
-    base = np.full((60, 100, 3), 120, np.uint8)
-    noise = np.random.default_rng(0).normal(0, 3, base.shape).astype(np.float32)
-    raw = np.full(base.shape, 115.0, np.float32) + noise
-    raw[:, 65:] = 85 + noise[:, 65:]  # the reference saw no gloss there, on a fifth of what lies round the hole
-    painted = np.zeros((60, 100), bool)
-    painted[20:40, 20:75] = True
-    band = ~painted
-    band[:, 85:] = False
-    blended = blend_band(base, raw, painted, band, 4.0, np.ones((60, 100)))
-    assert np.abs(blended[25:35, 72:].mean((0, 1)) - 120).max() < 10
-    assert np.abs(blended[25:35, 25].mean(0) - 120).max() < 4
-
-
-def test_where_hardly_any_photo_touches_the_hole_what_lies_farther_away_tells_its_level() -> None:
-    base = np.full((80, 80, 3), 150, np.uint8)
-    raw = np.full(base.shape, 130.0, np.float32)
-    painted = np.zeros((80, 80), bool)
-    painted[30:50, 30:50] = True
-    band = np.zeros_like(painted)
-    band[:15], band[51, 30:34] = True, True
-    base[51, 30:34] = 180  # a few pixels beside it show the object's edge
-    blended = blend_band(base, raw, painted, band, 4.0, np.ones((80, 80)))
-    assert np.abs(blended[painted].mean(0) - 150).max() < 3
