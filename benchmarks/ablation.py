@@ -124,6 +124,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "light differs by as much all round the hole": (("gimp3d.stages.propagate.blend:TOLERANCES", (1.0,)),),
     "the fill is as sharp as photos": (("gimp3d.stages.propagate.detail:BLURS", ()),),
     "the fill keeps the colours of its reference": (("gimp3d.stages.propagate.blend:TELLING", 1e9),),
+    "what goes with colour on one side goes so on all": (("gimp3d.stages.propagate.blend:_trust", lambda *_: 1.0),),
     "depth seams do not stop the blend": (("gimp3d.stages.propagate.blend:SEAM", 1e9),),
     # new Gaussians
     "one Gaussian per pixel": (("seed.largest", 1),),

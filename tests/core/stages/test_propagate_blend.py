@@ -211,3 +211,15 @@ def test_a_few_pixels_tell_nothing_of_colours() -> None:
     band = np.zeros_like(painted)
     band[24, 30:40] = True
     assert (colours_here(raw, np.zeros(raw.shape, np.uint8), painted, band, 5.0) == raw).all()
+
+
+def test_light_that_differs_from_side_to_side_is_no_matter_of_colour() -> None:
+    rng = np.random.default_rng(4)
+    right = np.zeros((80, 120), bool)
+    right[:, 60:] = True
+    grain = 30 * cv2.GaussianBlur(rng.normal(0, 4, (80, 120, 1)), (0, 0), 3)[..., None]
+    raw = (np.where(right[..., None], 140, 100) + grain + np.zeros(3)).astype(np.float32)
+    photo = np.clip(np.rint(raw + 25 * right[..., None]), 0, 255).astype(np.uint8)
+    painted = cloth_on_wood(rng)[2]
+    here = colours_here(raw, photo, painted, ~painted, 5.0)
+    assert np.abs(here - raw)[painted].mean() < 2

@@ -73,7 +73,8 @@ def colours_here(
     """The fill in the view's colours, [H, W, 3] float32, so far as photo and fill differ by what goes with colour.
 
     From one view to another wood shines and cloth does not, and exposures change contrast: a linear function of coarse
-    colours, by reweighted least squares (Holland and Welsch 1977) with a ridge of what tells nothing.
+    colours, by reweighted least squares (Holland and Welsch 1977) with a ridge of what tells nothing. It counts as far
+    as three quarters of the surroundings predict the fourth: errors of place and light go with colour by chance.
     """
     distance = cv2.distanceTransform((~painted).astype(np.uint8), cv2.DIST_L2, 5)
     band = band & (distance <= FAR * width)
@@ -84,14 +85,35 @@ def colours_here(
     told = colours[band]
     near = weight = 1 / (1 + (distance[band] / width) ** 2)
     for tolerance in TOLERANCES:
-        middle, usual = (np.average(v, axis=0, weights=weight) for v in (told, differs))
-        centred = told - middle
-        scaled = (weight / weight.sum())[:, None] * centred
-        slopes = np.linalg.solve(scaled.T @ centred + TELLING**2 * np.eye(3), scaled.T @ (differs - usual))
-        weight = near * biweight(differs - usual - centred @ slopes, tolerance)
+        middle, usual, slopes = _line(told, differs, weight)
+        weight = near * (biweight(differs - usual - (told - middle) @ slopes, tolerance) + LEAST_COUNT)
+    below, right = ((n[band] > n[painted].mean()) for n in np.indices(band.shape))
+    slopes = slopes * _trust(told, differs, weight, 2 * below + right)
     result = raw.copy()
     result[where] += (np.clip(colours[where], *np.percentile(told, USUAL, axis=0)) - middle) @ slopes
     return result
+
+
+def _line(told: np.ndarray, differs: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means [3] of colours and of differences [N, 3], and slopes [3, 3] of these over those."""
+    middle, usual = (np.average(v, axis=0, weights=weight) for v in (told, differs))
+    centred = told - middle
+    scaled = (weight / weight.sum())[:, None] * centred
+    bends = scaled.T @ centred + TELLING**2 * np.eye(3)
+    return middle, usual, np.linalg.solve(bends, scaled.T @ (differs - usual))
+
+
+def _trust(told: np.ndarray, differs: np.ndarray, weight: np.ndarray, quarter: np.ndarray) -> float:
+    """In [0, 1]: how much of what colours [N, 3] say of differences [N, 3] in the other quarters holds in each, [N]."""
+    both = square = 0.0
+    for number in np.unique(quarter):
+        on = quarter == number
+        if not on.all():
+            elsewhere, inside = _line(told, differs, np.where(on, 0, weight))[2], weight[on]
+            x, y = (v[on] - np.average(v[on], axis=0, weights=inside) for v in (told, differs))
+            both += (inside @ (x @ elsewhere * y)).sum()
+            square += (inside @ (x @ elsewhere) ** 2).sum()
+    return float(np.clip(both / square, 0, 1)) if square else 0.0
 
 
 def _blurred(values: np.ndarray, where: np.ndarray) -> np.ndarray:
