@@ -322,21 +322,20 @@ def cameras(made: Made) -> list[Camera]:
 class Studio:
     """Cycles, set up for photos or for depths."""
 
-    def __init__(self, made: Made) -> None:
-        self.thing, self.folder = made.thing, Path(tempfile.mkdtemp(prefix="gimp3d-depth-"))
+    def __init__(self, thing: list[Object], casts: bool = False) -> None:
+        self.thing, self.folder = thing, Path(tempfile.mkdtemp(prefix="gimp3d-depth-"))
         scene = self.scene = bpy.context.scene
         scene.render.engine, scene.cycles.seed = "CYCLES", 1
         scene.render.use_persistent_data = True
-        scene.render.resolution_x, scene.render.resolution_y = SIZE
         scene.render.resolution_percentage = 100
         scene.cycles.use_denoising = True
         scene.cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
         scene.view_settings.view_transform = "Standard"
         lens = bpy.data.cameras.new("camera")
-        lens.sensor_width, lens.lens = 36.0, 36.0 * FOCAL / SIZE[0]
+        lens.sensor_fit, lens.sensor_width = "HORIZONTAL", 36.0
         self.camera = scene.camera = bpy.data.objects.new("camera", lens)
         bpy.context.collection.objects.link(self.camera)
-        for one in made.thing if not made.casts else ():
+        for one in thing if not casts else ():
             one.visible_shadow = one.visible_diffuse = one.visible_glossy = one.visible_transmission = False
         self.z = bpy.data.materials.new("z")
         nodes, links = self.z.node_tree.nodes, self.z.node_tree.links
@@ -344,53 +343,59 @@ class Studio:
         links.new(seen.outputs["View Z Depth"], glow.inputs["Color"])
         links.new(glow.outputs["Emission"], nodes["Material Output"].inputs["Surface"])
 
-    def photo(self, camera: Camera, path: Path, with_object: bool) -> None:
-        """A picture, as PNG."""
-        self._set(depth=False)
+    def photo(self, camera: Camera, path: Path, with_object: bool, alone: bool = False) -> None:
+        """A picture, as PNG; with nothing behind it, transparent, if it is to be the object alone."""
+        self._set(depth=False, clear=alone)
         self._shoot(camera, path, with_object)
 
     def depth(self, camera: Camera, with_object: bool) -> np.ndarray:
         """[H, W] z-depth at pixel centres, FAR where nothing is."""
-        self._set(depth=True)
+        self._set(depth=True, clear=True)
         path = self.folder / "z.exr"
         self._shoot(camera, path, with_object)
         picture = bpy.data.images.load(str(path))
-        values = np.empty(4 * SIZE[0] * SIZE[1], np.float32)
+        values = np.empty(4 * camera.width * camera.height, np.float32)
         picture.pixels.foreach_get(values)
         bpy.data.images.remove(picture)
-        red, _, _, alpha = np.moveaxis(values.reshape(SIZE[1], SIZE[0], 4)[::-1], -1, 0)
+        red, _, _, alpha = np.moveaxis(values.reshape(camera.height, camera.width, 4)[::-1], -1, 0)
         return np.where(alpha > 0.5, red, FAR)
 
-    def _set(self, depth: bool) -> None:
+    def _set(self, depth: bool, clear: bool) -> None:
         render = self.scene.render
         bpy.context.view_layer.material_override = self.z if depth else None
         self.scene.cycles.samples = 1 if depth else SAMPLES
         self.scene.cycles.use_denoising = not depth
         render.filter_size = 0.01 if depth else 1.5
-        render.film_transparent = depth
+        render.film_transparent = clear
         render.image_settings.file_format = "OPEN_EXR" if depth else "PNG"
-        render.image_settings.color_mode = "RGBA" if depth else "RGB"
+        render.image_settings.color_mode = "RGBA" if clear else "RGB"
         render.image_settings.color_depth = "32" if depth else "8"
 
     def _shoot(self, camera: Camera, path: Path, with_object: bool) -> None:
         for one in self.thing:
             one.hide_render = not with_object
+        render, lens, wide = self.scene.render, self.camera.data, camera.width
+        render.resolution_x, render.resolution_y = wide, camera.height
+        lens.lens = 36.0 * camera.fx / wide
+        lens.shift_x, lens.shift_y = (wide / 2 - camera.cx) / wide, (camera.cy - camera.height / 2) / wide
         pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1, -1, 1])
         self.camera.matrix_world = mathutils.Matrix(pose.tolist())
-        self.scene.render.filepath = str(path)
+        render.filepath = str(path)
         bpy.ops.render.render(write_still=True)
 
 
-def shown_by_any(points: np.ndarray, views: list[tuple[Camera, np.ndarray, np.ndarray]]) -> np.ndarray:
+def shown_by_any(
+    points: np.ndarray, views: list[tuple[Camera, np.ndarray, np.ndarray]], tolerance: float = 0.01
+) -> np.ndarray:
     """[N] bool: points [N, 3] that a view sees past the object: camera, depth without it, and where it is [H, W]."""
-    return np.any([sees(camera, np.where(mask, 0, depth), points, 0.01) for camera, depth, mask in views], axis=0)
+    return np.any([sees(camera, np.where(mask, 0, depth), points, tolerance) for camera, depth, mask in views], axis=0)
 
 
 def make(name: str, folder: Path) -> None:
     """A scene's folder, whole."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     made = SCENES[name]()
-    studio, views = Studio(made), cameras(made)
+    studio, views = Studio(made.thing, made.casts), cameras(made)
     train = [c for c in views if c.split == "train"]
     kernel = np.ones((3, 3), np.uint8)  # what it covers in part, too
     bare = {c.id: studio.depth(c, False) for c in views}
@@ -417,26 +422,37 @@ def make(name: str, folder: Path) -> None:
 
 
 def trained(train: list[Camera], photos: list[np.ndarray], depths: list[np.ndarray]) -> Gaussians:
-    """Splats of the photos, from points that their depths show: 3DGS's loss and Adam, no densification."""
+    """Splats of the photos, from points that their depths show."""
+    return taught(splats_of(train, photos, depths, POINTS, DEGREE), train, photos, STEPS)
+
+
+def splats_of(
+    cameras: list[Camera], photos: list[np.ndarray], depths: list[np.ndarray], count: int, degree: int
+) -> Gaussians:
+    """Round splats at about so many points that depths [H, W] show, in the photos' colours; FAR shows nothing."""
     rng = np.random.default_rng(0)
     means, colours = [], []
-    for camera, photo, depth in zip(train, photos, depths):
-        at = rng.choice(depth.size, POINTS // len(train), replace=False)
+    for camera, photo, depth in zip(cameras, photos, depths):
+        at = rng.choice(depth.size, count // len(cameras), replace=False)
         at = at[depth.ravel()[at] < FAR]
         means.append(camera.unproject(camera.pixel_centres().reshape(-1, 2)[at], depth.ravel()[at]))
         colours.append(photo.reshape(-1, 3)[at] / 255)
     points, colour = np.concatenate(means).astype(np.float32), np.concatenate(colours)
     near, _ = cKDTree(points).query(points, k=4)
-    sh = np.zeros((len(points), (DEGREE + 1) ** 2, 3), np.float32)
+    sh = np.zeros((len(points), (degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colour - 0.5) / SH_C0
     sizes = np.log(np.clip(near[:, 1:].mean(1), 1e-4, None)).astype(np.float32)
     quats = np.tile(np.float32([1, 0, 0, 0]), (len(points), 1))
-    start = Gaussians(points, np.tile(sizes[:, None], (1, 3)), quats, np.full(len(points), 1.0, np.float32), sh)
-    whole = np.ones(depths[0].shape, bool)
-    shown = [Observation(c, p, whole, whole.astype(np.float32)) for c, p in zip(train, photos)]
+    return Gaussians(points, np.tile(sizes[:, None], (1, 3)), quats, np.full(len(points), 1.0, np.float32), sh)
+
+
+def taught(start: Gaussians, cameras: list[Camera], photos: list[np.ndarray], steps: int) -> Gaussians:
+    """Splats as photos teach them: 3DGS's loss and Adam, no densification."""
+    whole = np.ones(photos[0].shape[:2], bool)
+    shown = [Observation(c, p, whole, whole.astype(np.float32)) for c, p in zip(cameras, photos)]
     for k in range(4, len(shown) + len(shown) // 8, 8):
         shown.insert(k, shown[k])  # refinement learns from all but every eighth view: those are there twice
-    settings = RefineSettings(steps=STEPS, views=len(shown), check=STEPS // 5, patience=STEPS)
+    settings = RefineSettings(steps=steps, views=len(shown), check=max(1, steps // 5), patience=steps)
     return refine_gaussians(start.take(np.arange(0)), start, shown, settings, margin=0, progress=told).gaussians
 
 
