@@ -6,9 +6,9 @@ SCAN is a folder as `gimp3d bench` reads it: scene.ply, transforms.json with the
 the surface that the object is to stand on. It stands where pixel X, Y of the photo VIEW shows that surface, SIZE times
 as high as it is far from there. Light falls on it, but it casts no shadow; what the scan's splats draw before it hides
 it, unless the photo looks as that surface does. (Look at the photos: depths of rough scans hide badly, so a place that
-nothing stands before is best.) Every fifth photo that shows it is a test view. The splats are the scan's, less those that no other photo shows,
-with points of the object among them, and learn from the new photos: about three minutes on 2 cores. All benchmarks
-take the folder.
+nothing stands before is best.) Every fifth photo that shows it is a test view. The splats are the scan's, less those
+that no other photo shows, with points of the object among them, and learn from the new photos: about three minutes on
+2 cores. All benchmarks take the folder.
 """
 
 from __future__ import annotations
