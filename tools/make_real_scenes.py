@@ -7,7 +7,7 @@ the surface that the object is to stand on. It stands where pixel X, Y of the ph
 as high as it is far from there. Light falls on it, but it casts no shadow; what the scan's splats draw before it hides
 it, unless the photo looks as that surface does. (Look at the photos: depths of rough scans hide badly, so a place that
 nothing stands before is best.) Every fifth photo that shows it is a test view. The splats are the scan's, less those
-that no other photo shows, with points of the object among them, and learn from the new photos: about three minutes on
+that no other photo shows, with points of the object among them, and learn from the new photos: about four minutes on
 2 cores. All benchmarks take the folder.
 """
 
