@@ -101,7 +101,7 @@ def place_on(plane: Plane, camera: Camera, pixel: tuple[float, float], size: flo
     """Where a pixel shows a plane, for an object so many times as high as it is far."""
     ray = camera.unproject(np.array([pixel]), np.ones(1))[0] - camera.centre
     z = float((plane.origin - camera.centre) @ plane.normal / (ray @ plane.normal))
-    if z <= 0:
+    if not 0 < z < np.inf:
         raise BadInput(f"{camera.id}: pixel {pixel} does not show the surface")
     return Place(camera.centre + z * ray, np.stack([plane.right, plane.down, plane.normal], 1), size * z)
 

@@ -6,6 +6,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
+import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 from hypothesis import given
@@ -206,10 +207,11 @@ def test_a_fill_in_the_views_colours_keeps_them(seed: int, width: float) -> None
     assert np.abs(here - raw).max() < 1e-3
 
 
-def test_a_few_pixels_tell_nothing_of_colours() -> None:
+@pytest.mark.parametrize("count", [0, 10])
+def test_no_photo_or_a_few_pixels_of_it_tell_nothing_of_colours(count: int) -> None:
     raw, _, painted = cloth_on_wood(np.random.default_rng(3))
     band = np.zeros_like(painted)
-    band[24, 30:40] = True
+    band[24, 30 : 30 + count] = True
     assert (colours_here(raw, np.zeros(raw.shape, np.uint8), painted, band, 5.0) == raw).all()
 
 
