@@ -34,6 +34,7 @@ DULL = 0.5  # share of the light that the object takes from a surface and does n
 UNTOUCHED = 0.99  # share of light from which nothing is in the shadow
 FINER = 2  # times as many along a side, in which it is stored
 EDGES = (0.7, 1.5, 3.0, 6.0)  # texels, σ of the edges that a marked shadow may have
+MOSTLY = 0.5  # share of a lamp's shadow that is marked, if it is the one that is meant
 MIXED = 0.75  # share of light below which pixels beside the object are filled: its colours would be lifted too (3 dB)
 # Of the rim:
 WIDTH = 0.1  # of the hole's size: as far as such a shadow is sought; as far again lies what it is compared with
@@ -140,13 +141,22 @@ def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], regi
     )
     words += f", {lights[-1].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
 
-    def taken(ground: Ground) -> np.ndarray:
-        points = ground.points(FINER)
+    confidence = float(share * (1 - 1 / over_chance))
+    taken = _taken(occluder, lights, grounds, FINER)
+    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, confidence, words)
+
+
+def _taken(
+    occluder: Occluder, lights: Sequence[Light], grounds: Sequence[Ground], finer: int
+) -> tuple[np.ndarray, ...]:
+    """What an occluder takes of lights, [h, w, 3] float32 each, in pictures of the grounds that are so much finer."""
+
+    def of(ground: Ground) -> np.ndarray:
+        points = ground.points(finer)
         whole = taken_from(occluder, lights, points.reshape(-1, 3), ground.plane.normal)
         return whole.reshape(points.shape).astype(np.float32)
 
-    confidence = float(share * (1 - 1 / over_chance))
-    return Shadow(tuple(grounds), occluder, tuple(lights), tuple(map(taken, grounds)), explained, confidence, words)
+    return tuple(map(of, grounds))
 
 
 def marked_shadow(
@@ -158,8 +168,9 @@ def marked_shadow(
     """The shadow that a user marked, in masks [H, W] bool of the witnesses' views, None where there is none: where most
     of them see it on a ground, as dark as photos show it there.
 
-    What the object casts there is darker in some places than in others; if that explains less than evenly dark shapes
-    do, they tell. Their edge is as soft as photos show it: several softnesses share the strength.
+    What the object casts by a lamp whose shadow is mostly marked is darker in some places than in others, and its edge
+    fades beyond any mark: it is undone whole. If it explains less than evenly dark shapes do, or no lamp is known, they
+    tell. Their edge is as soft as photos show it: several softnesses share the strength.
     """
     if not grounds:
         return "the marked shadow falls on no surface that photos show: nothing is lifted"
@@ -173,12 +184,12 @@ def marked_shadow(
         return shadows, strength, besides, lit.loss(lit.residual(shadows @ strength, besides))
 
     shadows, strength, besides, loss = fitted(shapes)
-    if isinstance(cast, Shadow):
+    own = _of_marked_lamps(cast, shapes) if isinstance(cast, Shadow) else None
+    if own is not None:
         sizes = [g.known.shape[::-1] for g in grounds]
-        taken = tuple(_within(shape[..., -1], t) for shape, t in zip(shapes, cast.taken))
-        whole = [cv2.resize(t.mean(-1), size, interpolation=cv2.INTER_AREA)[..., None] for t, size in zip(taken, sizes)]
+        whole = [cv2.resize(t.mean(-1), s, interpolation=cv2.INTER_AREA)[..., None] for t, s in zip(own.taken, sizes)]
         if fitted(whole)[-1] < loss:
-            return Shadow(tuple(grounds), None, (), taken, cast.explained, 1.0, f"where it is marked: {cast.reason}")
+            return own
     if strength.sum() < FAINT:
         return "what is marked as shadow is not darker than what is round it: nothing is lifted"
     explained = lit.explained(shadows @ strength, besides)
@@ -188,11 +199,22 @@ def marked_shadow(
     return Shadow(tuple(grounds), None, (), taken, explained, 1.0, words)
 
 
-def _within(mark: np.ndarray, taken: np.ndarray) -> np.ndarray:
-    """[h, w, 3]: the light that is taken [h, w, 3] in a mark with soft edges [H, W], and a little beyond: it ends there
-    without an edge of its own."""
-    inside = np.minimum(2 * cv2.resize(mark, taken.shape[1::-1]), 1)
-    return (inside[..., None] * taken).astype(np.float32)
+def _of_marked_lamps(cast: Shadow, shapes: Sequence[np.ndarray]) -> Shadow | None:
+    """The shadow of those lamps alone that cast most of what photos show of it into marks [H, W, S] on its grounds, and
+    of the sky: whoever marks a shadow sees no more of it."""
+    occluder, grounds = cast.occluder, cast.grounds
+    assert occluder is not None
+
+    def meant(lamp: Light) -> bool:
+        taken = [t.mean(-1) * g.known for t, g in zip(_taken(occluder, [lamp], grounds, 1), grounds)]
+        within = sum(float((t * shape[..., 0]).sum()) for t, shape in zip(taken, shapes))
+        return within > MOSTLY * sum(float(t.sum()) for t in taken)
+
+    lights = tuple(light for light in cast.lights if math.isinf(light.softness) or meant(light))
+    if all(math.isinf(light.softness) for light in lights):
+        return None
+    taken = cast.taken if len(lights) == len(cast.lights) else _taken(occluder, lights, grounds, FINER)
+    return replace(cast, lights=lights, taken=taken, confidence=1.0, reason=f"as it is marked: {cast.reason}")
 
 
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:
