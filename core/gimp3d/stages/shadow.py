@@ -134,16 +134,19 @@ def find_shadow(gone: Gaussians, support: Plane, grounds: Sequence[Ground], regi
     if explained < FAINT:
         return "no shadow found: light is missing close to the object, as if in its shadow, but not round it"
     lights = [replace(light, strength=s * t) for light, s, t in zip(lights, strength, tints)]
+    confidence = float(share * (1 - 1 / over_chance))
+    taken = _taken(occluder, lights, grounds, FINER)
+    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, confidence, _told(lights, explained))
+
+
+def _told(lights: Sequence[Light], explained: float) -> str:
+    """Lamps, and the sky as the last one, in words."""
     words = ", ".join(
         f"{light.strength.mean():.0%} of the light comes from {light.elevation:.0f}° above the surface"
         f" (soft by {light.softness:.0f}°)"
         for light in lights[:-1]
     )
-    words += f", {lights[-1].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
-
-    confidence = float(share * (1 - 1 / over_chance))
-    taken = _taken(occluder, lights, grounds, FINER)
-    return Shadow(tuple(grounds), occluder, tuple(lights), taken, explained, confidence, words)
+    return f"{words}, {lights[-1].strength.mean():.0%} from the sky; {explained:.0%} of the unevenness is explained"
 
 
 def _taken(
@@ -188,8 +191,10 @@ def marked_shadow(
     if own is not None:
         sizes = [g.known.shape[::-1] for g in grounds]
         whole = [cv2.resize(t.mean(-1), s, interpolation=cv2.INTER_AREA)[..., None] for t, s in zip(own.taken, sizes)]
-        if fitted(whole)[-1] < loss:
-            return own
+        own_shadows, own_strength, own_besides, own_loss = fitted(whole)
+        if own_loss < loss:
+            explained = lit.explained(own_shadows @ own_strength, own_besides)
+            return replace(own, explained=explained, reason=f"as it is marked: {_told(own.lights, explained)}")
     if strength.sum() < FAINT:
         return "what is marked as shadow is not darker than what is round it: nothing is lifted"
     explained = lit.explained(shadows @ strength, besides)
@@ -214,7 +219,7 @@ def _of_marked_lamps(cast: Shadow, shapes: Sequence[np.ndarray]) -> Shadow | Non
     if all(math.isinf(light.softness) for light in lights):
         return None
     taken = cast.taken if len(lights) == len(cast.lights) else _taken(occluder, lights, grounds, FINER)
-    return replace(cast, lights=lights, taken=taken, confidence=1.0, reason=f"as it is marked: {cast.reason}")
+    return replace(cast, lights=lights, taken=taken, confidence=1.0)
 
 
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:
