@@ -48,13 +48,6 @@ def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
     return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
 
 
-def _known_if_shown(give: Callable[..., Any]) -> Callable[..., Any]:
-    def to_surface(selection: Any, scene: Any, sunk: Any, charts: Sequence[Any]) -> Any:
-        return give(selection, scene, sunk, [replace(c, known=c.there & (c.photos > 0) & ~c.hole) for c in charts])
-
-    return to_surface
-
-
 ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
 BY_PLACE_ALONE = Around(lambda besides: lambda surface, bent: besides(surface, bent)[:, : 5 if bent else 2])
 RULES: dict[str, tuple[Switch, ...]] = {
@@ -78,11 +71,13 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "no haze is cleared": (("gimp3d.stages.clearing:HAZE_WEIGHT", math.inf),),
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
     "a tenth of it is": (("clearing.observed", 0.1),),
-    "what a box cuts out of a surface counts as the object": (
-        ("gimp3d.steps.behind:sunk_rows", lambda *_: np.zeros(0, int)),
+    "colours do not tell the object from what is beside it": (
+        ("gimp3d.steps.behind:shown_beside", lambda scene, *_: np.zeros(len(scene), bool)),
     ),
-    "a surface need not be agreed on to get back what a box cut out": (
-        ("gimp3d.steps.behind:with_surface", Around(_known_if_shown)),
+    "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", 1),),
+    "a tenth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.1),),
+    "charts take colours where a foot may be": (
+        ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
     "photos of rests vouch for them, and are not filled": (
         ("gimp3d.steps.behind:hiding_rests", lambda witnesses, _: witnesses),

@@ -17,7 +17,7 @@ from ..schema import Share
 from .charts import INLIER, Chart, Hits, Laid, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
-from .witness import AGREEING, Witness, total_over
+from .witness import Witness, total_over
 
 OBJECT, ELSE = 1, 2  # labels of a view's pixels
 SOME_WEIGHT = 0.1  # blend weight of the removed Gaussians from which a photo may show some of the object
@@ -61,28 +61,16 @@ def pixels_of(weight: np.ndarray, settings: ClearingSettings) -> tuple[np.ndarra
     return shown, some
 
 
-def sunk_rows(scene: Gaussians, selection: Selection, laid: Sequence[Laid]) -> np.ndarray:
-    """[M] rows taken for the object that do not stand before a surface: splats of floors mostly lie a little below."""
-    rows = np.flatnonzero(np.isin(selection.fates, (Fate.REMOVED_INSIDE, Fate.REMOVED_STRADDLING)))
-    sunk = np.zeros(len(rows), bool)
+def over_surfaces(scene: Gaussians, region: Region, laid: Sequence[Laid]) -> tuple[np.ndarray, np.ndarray]:
+    """What lies low over a surface or as little below it, and what lies below one; [N] bool each."""
+    low, sunk = np.zeros((2, len(scene)), bool)
+    means = scene.means.astype(np.float64)
     for one in laid:
-        index, *at, z = framed(one.camera, scene.means[rows].astype(np.float64))
-        sunk[index] |= z > one.depth[tuple(at)]
-    return rows[sunk]
-
-
-def with_surface(selection: Selection, scene: Gaussians, sunk: np.ndarray, charts: Sequence[Chart]) -> Selection:
-    """The selection without the sunk rows [M] in whose place photos agree on a surface: no box cuts that out.
-
-    The charts are drawn as if these rows hid nothing, so few photos would take the object for the surface.
-    """
-    fates = selection.fates.copy()
-    for chart in (c for c in charts if c.photos.max() >= AGREEING):
-        index, *at, z = framed(chart.camera, scene.means[sunk].astype(np.float64))
-        texels = tuple(at)
-        shown = (chart.there & chart.known & ~chart.below)[texels]
-        fates[sunk[index[shown & (z > chart.depth[texels])]]] = Fate.KEPT_SURFACE
-    return Selection(fates)
+        index, *at, z = framed(one.camera, means)
+        above = one.depth[tuple(at)] - z
+        low[index] |= np.abs(above) < LOW * extent(region)
+        sunk[index] |= above < 0
+    return low, sunk
 
 
 def stand_on_hole(chart: Chart, texels: tuple[np.ndarray, ...], above: np.ndarray) -> np.ndarray:
@@ -111,6 +99,7 @@ def clear_air(
     selection: Selection,
     witnesses: Sequence[Witness],
     charts: Sequence[Chart],
+    beside: np.ndarray,  # [N] bool, what photos show beside the object by its colours: no haze
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
     """Remove what only the removal reveals and no photo shows, and rests of the object.
@@ -128,7 +117,7 @@ def clear_air(
         return np.stack([(seen > LEAST_SEEN) & (seen >= settings.observed * (seen + hidden)), hidden])
 
     photos, hidden = total_over(witnesses, of, (2, len(kept)))[:, near[stays]]
-    fates[rows[(photos == 0) & (hidden > HAZE_WEIGHT)]] = Fate.REMOVED_REVEALED
+    fates[rows[(photos == 0) & (hidden > HAZE_WEIGHT) & ~beside[rows]]] = Fate.REMOVED_REVEALED
     means = scene.means[rows].astype(np.float64)
     gone, known = np.zeros((2, len(rows)), bool)
     for chart in charts:

@@ -24,8 +24,9 @@ from ..presets import RemovalSettings
 from ..progress import Progress
 from ..raster import label_weights
 from ..run import ViewState
+from ..stages.beside import Sight, shown_beside
 from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
-from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, pixels_of, sunk_rows, with_surface
+from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, over_surfaces, pixels_of
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
 from ..stages.masks import Masks, ViewMasks
@@ -33,7 +34,7 @@ from ..stages.occluder import support_first
 from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.reflection import Reflection, find_reflection
 from ..stages.seed import OWN_RULES
-from ..stages.selection import Selection, near_region
+from ..stages.selection import Fate, Selection, near_region
 from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
 from ..stages.witness import Witness, total_over
 from .references import emptied
@@ -45,6 +46,8 @@ NOTHING: dict[str, dict[str, Any]] = {
 LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them (kitchen_monkey −0.2 dB, real_bed −0.1)
 ROUND = 24  # px round the object in which photos teach
 PLACE, ELSEWHERE = 1, 2  # labels of a view's pixels: the object's place, and all others
+LEFT = Fate.KEPT_STRADDLING, Fate.KEPT_SURFACE  # what stays of what reaches into the boxes
+NAMED = Fate.REMOVED_MASKED, Fate.REMOVED_GROWN  # what the user wants gone whatever it looks like
 SHOWN = 2.0  # px of blend weight in the object's place, over all views, from which a Gaussian learns
 SHARE = 0.1  # of all its weight; what draws other places more than this one is left alone
 LARGEST = 0.5  # diagonals of the region, σ: giants of the background show in many places
@@ -59,15 +62,18 @@ class Surfaces:
 
     planes: tuple[Plane, ...]
     laid: tuple[Laid, ...]  # those of which the object hides something
-    selection: Selection  # without what photos show to be surface
+    selection: Selection  # without what photos show beside the object
+    beside: np.ndarray  # [N] bool, that
     objects: Sequence[tuple[np.ndarray, np.ndarray]]  # see pixels_of
+    doubtful: Sequence[tuple[np.ndarray, np.ndarray]]  # the same, with what stands before a surface though it stays
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
     reason: str
 
-    def witnesses(self, views: Sequence[ViewState]) -> list[Witness]:
+    def witnesses(self, views: Sequence[ViewState], wary: bool = False) -> list[Witness]:
+        """The views; with `wary`, of nothing that may be a foot: its colours do not tell it from a fold."""
         found = []
-        for v, (hidden, beside), marked in zip(views, self.objects, self.marked):
+        for v, (hidden, beside), marked in zip(views, self.doubtful if wary else self.objects, self.marked):
             veiled = (v.masks.alpha_before < SOLID) | v.masks.occluder
             found.append(Witness(v.camera, v.bare, hidden | marked, beside, veiled, v.masks.depth_before))
         return found
@@ -92,24 +98,31 @@ def find_surfaces(
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
 
     objects, selection = parallel_map(lambda v: pixels_of(v.weight, settings.clearing), masks.views), masks.selection
-    found = Surfaces((), (), selection, objects, marked, 1.0, "")
-
-    def without(removed: np.ndarray) -> Surfaces:
-        return replace(found, objects=object_pixels(scene, removed, masks.views, settings.clearing))
-
+    none = np.zeros(len(scene), bool)
+    found = Surfaces((), (), selection, none, objects, objects, marked, 1.0, "")
     witnesses = found.witnesses(views)
     planes = find_planes(witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, witnesses, region, settings.charts)
     reason = f"{len(planes)} planes run into what the object hid"
-    sunk = sunk_rows(scene, masks.selection, laid)
-    if len(sunk):
-        standing = masks.removed
-        standing[sunk] = False
-        charts = draw_charts(laid, without(standing).witnesses(views), region, marked)
-        selection = with_surface(masks.selection, scene, sunk, charts)
-        reason += f", {int((masks.removed & ~selection.removed).sum())} Gaussians of theirs stay"
-        found = without(selection.removed)
-    return replace(found, planes=planes, laid=laid, selection=selection, reason=reason)
+    found = replace(found, planes=planes, laid=laid, reason=reason)
+    low, sunk = over_surfaces(scene, region, laid)
+    may = low & scene.usable & near_region(scene, region, 1.0) & ~np.isin(selection.fates, NAMED)
+    if not may.any():
+        return found
+    sights = [Sight(v.camera, s.bare, v.polygon, mark) for v, s, mark in zip(masks.views, views, marked)]
+    goes = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
+    stays = np.isin(selection.fates, LEFT)
+    beside, object_ = shown_beside(scene, goes, stays, may, sights)
+    back, removed = selection.removed & beside, (selection.removed & ~beside) | object_
+    if back.any() or object_.any():
+        fates = np.where(back, np.uint8(Fate.KEPT_SURFACE), selection.fates)
+        fates[object_] = Fate.REMOVED_STRADDLING
+        objects, doubtful = (
+            object_pixels(scene, rows, masks.views, settings.clearing) for rows in (removed, removed | (back & ~sunk))
+        )
+        reason += f", {int(back.sum())} Gaussians are shown beside it and stay, {int(object_.sum())} as it and go"
+        found = replace(found, selection=Selection(fates), objects=objects, doubtful=doubtful, reason=reason)
+    return replace(found, beside=beside)
 
 
 @dataclass(frozen=True)
@@ -123,7 +136,7 @@ class Charted:
 
 def chart_surfaces(region: Region, surfaces: Surfaces, views: Sequence[ViewState]) -> Charted:
     """Show the hidden surfaces."""
-    charts = draw_charts(surfaces.laid, surfaces.witnesses(views), region, surfaces.marked)
+    charts = draw_charts(surfaces.laid, surfaces.witnesses(views, wary=True), region, surfaces.marked)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     if not charts:
         return Charted((), 0.0, "no surface runs into what the object hid")
@@ -149,8 +162,9 @@ def clear_round(
     settings: RemovalSettings,
 ) -> Cleared:
     """Clear the air before charts, and say where they have to be filled."""
+    wary = hiding_rests(surfaces.witnesses(views, wary=True), charts)
+    selection = clear_air(scene, region, surfaces.selection, wary, charts, surfaces.beside, settings.clearing)
     witnesses = hiding_rests(surfaces.witnesses(views), charts)
-    selection = clear_air(scene, region, surfaces.selection, witnesses, charts, settings.clearing)
     targets = chart_targets(scene, selection, [v.masks for v in views], witnesses, charts, surfaces.marked)
     cleared = int((selection.removed & ~surfaces.selection.removed).sum())
     return Cleared(selection, targets, 1.0, f"{cleared} of haze go")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,10 +23,10 @@ from gimp3d.stages.clearing import (
     clear_air,
     hiding_rests,
     object_pixels,
-    sunk_rows,
-    with_surface,
+    over_surfaces,
 )
 from gimp3d.stages.exposure import Exposure
+from gimp3d.stages.look import box_polygon, fill_polygon
 from gimp3d.stages.masks import Masks, ViewMasks
 from gimp3d.stages.selection import Fate, Selection
 from gimp3d.stages.witness import Says, Witness, ask
@@ -92,12 +93,17 @@ def targets(plain: Removal, charts: tuple[Chart, ...]) -> Targets:
 
 
 def cleared(
-    removal: Removal, witnesses: list[Witness] | None = None, charts: tuple[Chart, ...] = (), observed: float = 0.2
+    removal: Removal,
+    witnesses: list[Witness] | None = None,
+    charts: tuple[Chart, ...] = (),
+    observed: float = 0.2,
+    beside: Sequence[int] = (),
 ) -> np.ndarray:
     """Rows that clear_air removes on top of the selection's."""
     settings = ClearingSettings(observed=observed)
     told = removal.witnesses if witnesses is None else witnesses
-    after = clear_air(removal.scene, REGION, removal.selection, told, charts, settings)
+    shown = np.isin(np.arange(len(removal.scene)), beside)
+    after = clear_air(removal.scene, REGION, removal.selection, told, charts, shown, settings)
     new = after.removed & ~removal.selection.removed
     assert (after.fates[new] == Fate.REMOVED_REVEALED).all()
     np.testing.assert_array_equal(after.fates[~new], removal.selection.fates[~new])
@@ -194,42 +200,21 @@ def test_rests_are_part_of_the_object_in_photos_that_show_them(plain: Removal, c
     assert hiding_rests(nearer, (replace(chart, rests=np.zeros_like(chart.rests)),)) == nearer
 
 
-def with_taken(plain: Removal, places: list[list[float]], fates: list[Fate]) -> tuple[Gaussians, Selection]:
-    whole = plain.scene.extended(specks(places))
-    return whole, Selection(np.concatenate([plain.selection.fates, np.array(fates, np.uint8)]))
-
-
-def test_what_stands_before_no_surface_is_sunk(plain: Removal) -> None:
-    """Of what went for lying in the box, or on the object; a user's mask is another matter, and what stays stays."""
-    places = [[OFF, 0, -0.02], [OFF, 0.1, 0.01], [OFF, 0, -0.02], [OFF, 0, -0.02], [0, 0, -0.02]]
-    fates = [Fate.REMOVED_INSIDE, Fate.REMOVED_INSIDE, Fate.REMOVED_MASKED, Fate.OUTSIDE, Fate.REMOVED_STRADDLING]
-    whole, selection = with_taken(plain, places, fates)
-    laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.witnesses, REGION)
-    assert set(sunk_rows(whole, selection, laid) - len(plain.scene)) & set(range(5)) == {0, 4}
-    assert not len(sunk_rows(whole, selection, ()))
-
-
-def test_sunk_splats_stay_where_photos_show_the_surface(plain: Removal, charts: tuple[Chart, ...]) -> None:
-    """Not under the object, and not where photos show it.
-
-    What is before this surface lay below another one, which photos may not show there.
-    """
-    places = [[OFF, 0, -0.02], [0, 0, -0.02], [-OFF, 0, -0.02], [OFF, 0, 0.02]]
-    whole, selection = with_taken(plain, places, [Fate.REMOVED_INSIDE] * 4)
+def test_what_photos_show_beside_the_object_is_no_haze_but_may_be_its_foot(charts: tuple[Chart, ...]) -> None:
+    given = removal(specks([[0, 0, 0.25], [OFF, 0, 0.02]]))
     (chart,) = charts
-    uv, _ = chart.camera.project(np.array([[-OFF, 0.0, 0.0]]))
-    col, row = uv[0].astype(int)
-    rests = np.zeros_like(chart.rests)
-    rests[row - 3 : row + 4, col - 3 : col + 4] = True
-    chart = replace(chart, rests=rests, hole=chart.hole | rests, known=chart.known & ~rests)
-    sunk = len(plain.scene) + np.arange(4)
-    fates = with_surface(selection, whole, sunk, (chart,)).fates[len(plain.scene) :]
-    assert list(fates) == [Fate.KEPT_SURFACE] + [Fate.REMOVED_INSIDE] * 3
-    disputed = replace(chart, known=np.zeros_like(chart.known))  # a foot that stands there, in each photo elsewhere
-    assert (with_surface(selection, whole, sunk, (disputed,)).fates[len(plain.scene) :] == Fate.REMOVED_INSIDE).all()
-    for few in (1, 2):  # with these rows away, few photos show whatever they show
-        hardly = replace(chart, photos=np.minimum(chart.photos, few))
-        assert (with_surface(selection, whole, sunk, (hardly,)).fates[len(plain.scene) :] == Fate.REMOVED_INSIDE).all()
+    haze, foot = range(len(given.scene) - 2, len(given.scene))
+    holed = (with_hole(chart, OFF),)
+    assert {haze, foot} <= set(cleared(given, charts=holed))
+    assert {foot} == {haze, foot} & set(cleared(given, charts=holed, beside=[haze, foot]))
+
+
+def test_low_over_a_surface_and_below_it(plain: Removal) -> None:
+    places = [[OFF, 0, -0.02], [OFF, 0.1, 0.01], [OFF, 0, -0.3], [OFF, 0, 0.3], [0, 0, -0.02]]
+    laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.witnesses, REGION)
+    low, sunk = over_surfaces(specks(places), REGION, laid)
+    assert list(np.flatnonzero(low)) == [0, 1, 4] and list(np.flatnonzero(sunk)) == [0, 2, 4]
+    assert not np.any(over_surfaces(specks(places), REGION, ()))
 
 
 def test_floor_that_selection_took_is_no_object_in_photos() -> None:
@@ -239,7 +224,13 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     whole = replace(plain.scene, means=plain.scene.means - np.float32([0, 0, 0.01]) * ring[:, None])
     taken = np.where(ring, np.uint8(Fate.REMOVED_INSIDE), plain.selection.fates)
     gone = taken >= Fate.REMOVED_INSIDE
-    seen = tuple(replace(v, weight=footprint(whole, v.camera, gone)) for v in plain.views)
+    boxes = [
+        fill_polygon(outline, v.camera) for v in plain.views if (outline := box_polygon(*REGION, v.camera)) is not None
+    ]
+    seen = tuple(
+        replace(v, polygon=box, weight=footprint(whole, v.camera, gone))
+        for v, box in zip(plain.views, boxes, strict=True)
+    )
     masks = Masks(Selection(taken), seen, "need", 1.0, "")
     photos = [render_bytes(whole, v.camera) for v in plain.views]
     levelled = Exposure(np.ones(3))
@@ -412,6 +403,7 @@ def test_views_after_are_those_of_the_emptied_scene(plain: Removal, targets: Tar
 def test_without_charts_there_is_no_confidence(plain: Removal) -> None:
     views = [ViewState.first(v, w.photo, Exposure(np.ones(3))) for v, w in zip(plain.views, plain.witnesses)]
     objects = [(w.hidden, w.beside) for w in plain.witnesses]
-    surfaces = Surfaces((), (), plain.selection, objects, (NONE,) * len(EYES), 1.0, "")
+    none = np.zeros(len(plain.scene), bool)
+    surfaces = Surfaces((), (), plain.selection, none, objects, objects, (NONE,) * len(EYES), 1.0, "")
     found = chart_surfaces(REGION, surfaces, views)
     assert not found.charts and found.confidence == 0 and found.reason.startswith("no surface")
