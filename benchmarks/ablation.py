@@ -74,16 +74,15 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours do not tell the object from what is beside it": (
         ("gimp3d.steps.behind:shown_beside", lambda scene, *_: np.zeros(len(scene), bool)),
     ),
-    "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", 1),),
-    "a tenth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.1),),
+    "what was left is not asked": (("gimp3d.steps.behind:LEFT", ()),),
+    "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),
+    "photos are cut at their own size": (("gimp3d.stages.beside:ROUNDS", (1, 1)),),
+    "a twentieth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.05),),
     "charts take colours where a foot may be": (
         ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
     "photos of rests vouch for them, and are not filled": (
         ("gimp3d.steps.behind:hiding_rests", lambda witnesses, _: witnesses),
-    ),
-    "what stands on holes stays if a photo shows it": (
-        ("gimp3d.stages.clearing:stand_on_hole", lambda chart, texels, above: np.zeros(len(above), bool)),
     ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
@@ -98,7 +97,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "a surface begins anew where it goes through another": (
         ("gimp3d.stages.charts:_shown", Around(lambda shown: lambda *p: shown(*p[:4], np.ones_like(p[4])))),
     ),
-    "only charts hold what stands low on a hole": (("gimp3d.stages.clearing:INLIER", 0.0),),
     "surfaces too close for rough depths are all there": (
         ("gimp3d.stages.charts:_parted", lambda drawn, _: [chart for chart, _ in drawn]),
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ from ..raster import drawing, label_weights
 from .selection import LEAST_WEIGHT
 from .witness import total_over
 
-ROUNDS = 2  # of the cut, the second from what the first found in all photos
+ROUNDS = 1, 2  # times a photo's size at which it is cut, from what the round before found in all; larger cuts lose less
 MOSTLY = 0.5  # share of blend weight in a pixel that decides: the majority
 PURE = 0.7  # share from which a pixel has nobody else's colour
 LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's
@@ -45,9 +46,9 @@ def shown_beside(
     show as the object's to some share: so they tell each other.
     """
     begins, sure, (beside, object_) = goes, goes & ~may, np.zeros((2, len(scene)), bool)
-    asked, sights = goes | stays | may, [sight for sight in sights if sight.polygon.any()]
+    in_boxes, sights = goes | stays, [sight for sight in sights if sight.polygon.any()]
 
-    def of(sight: Sight) -> np.ndarray:
+    def of(size: float, sight: Sight) -> np.ndarray:
         drawn = drawing(scene, sight.camera, with_colour=False, pixels=sight.polygon)
         certain = cv2.erode((drawn.footprint(sure) > PURE).astype(np.uint8), np.ones((3, 3))) > 0
         start = np.full(sight.polygon.shape, cv2.GC_BGD, np.uint8)
@@ -57,15 +58,16 @@ def shown_beside(
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)
         labels = np.where(sight.marked, OBJECT, ELSE).astype(np.uint8)
-        labels[window][_cut(sight.photo[window], start[window])] = OBJECT
-        return label_weights(scene, sight.camera, labels, OBJECT, asked)
+        labels[window][_cut(sight.photo[window], start[window], size)] = OBJECT
+        return label_weights(scene, sight.camera, labels, OBJECT, in_boxes | may)
 
-    for _ in range(ROUNDS):
-        elsewhere, on_object = total_over(sights, of, (OBJECT, len(scene)))
+    for size in ROUNDS:
+        elsewhere, on_object = total_over(sights, partial(of, size), (OBJECT, len(scene)))
         shown = elsewhere + on_object
         beside = may & (shown > LEAST_WEIGHT) & (on_object <= LEAST * shown)
         object_ = stays & (shown > LEAST_WEIGHT) & (on_object > MOSTLY * shown)
-        begins = (goes | stays) & (on_object > SOME * shown)
+        sure = sure | (in_boxes & (on_object > MOSTLY * shown))
+        begins = in_boxes & (on_object > SOME * shown)
     return beside, object_
 
 
@@ -75,14 +77,14 @@ def _window(polygon: np.ndarray) -> Window:
     return slice(max(0, top - MARGIN), bottom + 1 + MARGIN), slice(max(0, left - MARGIN), right + 1 + MARGIN)
 
 
-def _cut(photo: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _cut(photo: np.ndarray, start: np.ndarray, times: float) -> np.ndarray:
     """[h, w] bool: what is the object's by its colours; `start` as GrabCut names it."""
-    share = min(1.0, LARGEST / max(start.shape))
-    size = [max(1, round(n * share)) for n in start.shape[::-1]]
+    times = min(times, LARGEST / max(start.shape))
+    size = [max(1, round(n * times)) for n in start.shape[::-1]]
     labels = cv2.resize(start, size, interpolation=cv2.INTER_NEAREST)
     if len(np.unique(labels & 1)) == 2:
         background, foreground = np.zeros((2, 1, 65))
         cv2.setRNGSeed(0)  # of this thread: what k-means begins with
-        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR)
         cv2.grabCut(small, labels, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)
     return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0

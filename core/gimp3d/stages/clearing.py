@@ -14,7 +14,7 @@ from ..gaussians import Gaussians
 from ..geometry import dilated, framed, window_mask
 from ..raster import drawing, footprint, label_weights, touched_window
 from ..schema import Share
-from .charts import INLIER, Chart, Hits, Laid, extent, first_hits
+from .charts import Chart, Hits, Laid, extent, first_hits
 from .masks import ViewMasks
 from .selection import Fate, Selection, near_region
 from .witness import Witness, total_over
@@ -25,7 +25,7 @@ RIM = 1  # px by which the object is larger in the photo than in the splats
 SPECK = 3  # px; smaller spots are splats of the floor that went along
 HAZE_WEIGHT = 0.5  # px of blend weight, over all views, below which a Gaussian draws nothing
 LEAST_SEEN = 0.5  # px of blend weight in a photo, below which it shows nothing of a Gaussian
-LOW = 0.1  # diagonals of the region above the surface up to which a rest of the object may stand
+LOW = 0.1  # diagonals of the region over or below a surface up to which a Gaussian may be its
 REACH = 24  # px round the removed Gaussians in which the scene is drawn anew: their dilated surroundings
 TOUCHED = 0.05  # blend weight of the removed Gaussians from which a pixel changes
 SURFACE = 0.5  # opacity below which the scene has no surface
@@ -73,11 +73,6 @@ def over_surfaces(scene: Gaussians, region: Region, laid: Sequence[Laid]) -> tup
     return low, sunk
 
 
-def stand_on_hole(chart: Chart, texels: tuple[np.ndarray, ...], above: np.ndarray) -> np.ndarray:
-    """[N] bool: of Gaussians over these (rows, cols), so far above the surface, those that stand on its hole."""
-    return chart.hole[texels] & (above > 0)
-
-
 def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
     """The witnesses with rests of the object as part of it: photos of them vouch for nothing, and are filled."""
     if not any(chart.rests.any() for chart in charts):
@@ -98,15 +93,13 @@ def clear_air(
     region: Region,
     selection: Selection,
     witnesses: Sequence[Witness],
-    charts: Sequence[Chart],
     beside: np.ndarray,  # [N] bool, what photos show beside the object by its colours: no haze
     settings: ClearingSettings = ClearingSettings(),
 ) -> Selection:
-    """Remove what only the removal reveals and no photo shows, and rests of the object.
+    """Remove what only the removal reveals and no photo shows.
 
     A photo shows a Gaussian by a share of what that draws in the emptied scene: not what lies where the object is, and
-    it does not tell what is right beside that. Low on its rests stands nothing but the object, nor on a hole, unless
-    another surface is known there, or whole; surface that reaches below a hole stays if some photo shows it.
+    it does not tell what is right beside that.
     """
     stays, near = ~selection.removed, scene.usable & near_region(scene, region, 1.0)
     kept, rows, fates = scene.take(stays), np.flatnonzero(stays & near), selection.fates.copy()
@@ -118,18 +111,6 @@ def clear_air(
 
     photos, hidden = total_over(witnesses, of, (2, len(kept)))[:, near[stays]]
     fates[rows[(photos == 0) & (hidden > HAZE_WEIGHT) & ~beside[rows]]] = Fate.REMOVED_REVEALED
-    means = scene.means[rows].astype(np.float64)
-    gone, known = np.zeros((2, len(rows)), bool)
-    for chart in charts:
-        index, *at, z = framed(chart.camera, means)
-        above, texels = chart.depth[tuple(at)] - z, tuple(at)
-        low = np.abs(above) < LOW * extent(region)
-        gone[index] |= low & (chart.rests[texels] | stand_on_hole(chart, texels, above))
-        known[index] |= low & chart.known[texels]
-        for plane in chart.others:
-            if all(plane is not c.plane for c in charts):  # the object hides nothing of it
-                known |= np.abs(plane.local(means)[:, 2]) < INLIER * extent(region)
-    fates[rows[gone & ~known]] = Fate.REMOVED_REVEALED
     return Selection(fates)
 
 

@@ -29,7 +29,7 @@ from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_
 from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, over_surfaces, pixels_of
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
-from ..stages.masks import Masks, ViewMasks
+from ..stages.masks import Masks, ViewMasks, spread_views
 from ..stages.occluder import support_first
 from ..stages.refine import Observation, looked_at, refine_gaussians
 from ..stages.reflection import Reflection, find_reflection
@@ -47,6 +47,7 @@ LEARNED = ("opacity_logits", "sh")  # shapes stay: photos of one side tear them 
 ROUND = 24  # px round the object in which photos teach
 PLACE, ELSEWHERE = 1, 2  # labels of a view's pixels: the object's place, and all others
 LEFT = Fate.KEPT_STRADDLING, Fate.KEPT_SURFACE  # what stays of what reaches into the boxes
+CUT = 24  # photos cut by their colours: half of 42 and 48 tell the same of real_table and real_bed
 NAMED = Fate.REMOVED_MASKED, Fate.REMOVED_GROWN  # what the user wants gone whatever it looks like
 SHOWN = 2.0  # px of blend weight in the object's place, over all views, from which a Gaussian learns
 SHARE = 0.1  # of all its weight; what draws other places more than this one is left alone
@@ -109,7 +110,9 @@ def find_surfaces(
     may = low & scene.usable & near_region(scene, region, 1.0) & ~np.isin(selection.fates, NAMED)
     if not may.any():
         return found
-    sights = [Sight(v.camera, s.bare, v.polygon, mark) for v, s, mark in zip(masks.views, views, marked)]
+    asked = {camera.id for camera in spread_views([v.camera for v in masks.views], region, CUT)}
+    looks = zip(masks.views, views, marked)
+    sights = [Sight(v.camera, s.bare, v.polygon, m) for v, s, m in looks if v.camera.id in asked]
     goes = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
     stays = np.isin(selection.fates, LEFT)
     beside, object_ = shown_beside(scene, goes, stays, may, sights)
@@ -163,7 +166,7 @@ def clear_round(
 ) -> Cleared:
     """Clear the air before charts, and say where they have to be filled."""
     wary = hiding_rests(surfaces.witnesses(views, wary=True), charts)
-    selection = clear_air(scene, region, surfaces.selection, wary, charts, surfaces.beside, settings.clearing)
+    selection = clear_air(scene, region, surfaces.selection, wary, surfaces.beside, settings.clearing)
     witnesses = hiding_rests(surfaces.witnesses(views), charts)
     targets = chart_targets(scene, selection, [v.masks for v in views], witnesses, charts, surfaces.marked)
     cleared = int((selection.removed & ~surfaces.selection.removed).sum())

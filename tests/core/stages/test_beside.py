@@ -19,6 +19,7 @@ SURROUNDINGS = floor(with_hole=True)
 SCENE = SURROUNDINGS.extended(block())
 OBJECT = np.arange(len(SCENE)) >= len(SURROUNDINGS)
 RING = ~OBJECT & (np.abs(SCENE.means[:, :2]).max(1) < BLOCK / 2 + 0.15)  # of the floor, that a box took too
+OUTER = RING & (np.abs(SCENE.means[:, :2]).max(1) > BLOCK / 2 + 0.06)  # of it, what shares no pixels with the block
 MAY = np.abs(SCENE.means[:, 2]) < LOW
 
 
@@ -32,58 +33,68 @@ def sights(scene: Gaussians = SCENE, scale: int = 1) -> list[Sight]:
     return found
 
 
+NONE = np.zeros(len(SCENE), bool)
+
+
 def weight(rows: np.ndarray) -> float:
     """Of the ring's rows, those that are given."""
     return float(rows[RING].mean())
 
 
 def test_floor_that_a_box_took_is_shown_beside_the_object_and_its_foot_is_not() -> None:
-    found = shown_beside(SCENE, OBJECT | RING, MAY, sights())
-    outer = RING & (np.abs(SCENE.means[:, :2]).max(1) > BLOCK / 2 + 0.06)  # beside what its pixels show of the block
-    assert found[outer].mean() > 0.9 and not found[OBJECT].any()
-    assert not found[~MAY].any()
+    found, object_ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
+    assert found[OUTER].mean() > 0.9 and not found[OBJECT].any()
+    assert not found[~MAY].any() and not object_.any()
 
 
 def test_of_what_stays_it_tells_too() -> None:
-    found = shown_beside(SCENE, OBJECT, MAY, sights())
+    found, _ = shown_beside(SCENE, OBJECT, NONE, MAY, sights())
     away = MAY & ~OBJECT & (np.abs(SCENE.means[:, :2]).max(1) > BLOCK / 2 + 0.1)
     near = away & (np.abs(SCENE.means[:, :2]).max(1) < BLOCK)
-    assert found[near].mean() > 0.98
+    assert found[near].all()
+
+
+def test_a_foot_that_was_taken_for_the_floor_is_shown_as_the_object() -> None:
+    foot = OBJECT & MAY
+    _, object_ = shown_beside(SCENE, OBJECT & ~MAY, foot | RING, MAY, sights())
+    seen = foot & (np.abs(SCENE.means[:, :2]).max(1) > 0.9 * BLOCK / 2)
+    assert object_[seen].mean() > 0.9 and not object_[OUTER].any()
+    assert not object_[~(foot | RING)].any()
 
 
 def test_what_stands_clear_of_the_floor_is_never_the_floors_and_tells_of_its_foot() -> None:
     """An object of the floor's own colours: little of its foot is taken for the floor."""
     grey = replace(SCENE, sh=np.where(OBJECT[:, None, None], SURROUNDINGS.sh.mean(0), SCENE.sh).astype(np.float32))
-    found = shown_beside(grey, OBJECT | RING, MAY, sights(grey))
+    found, _ = shown_beside(grey, OBJECT | RING, NONE, MAY, sights(grey))
     assert found[OBJECT & MAY].mean() < 0.1
 
 
 def test_what_is_marked_goes_whatever_its_colours_say() -> None:
     marked = [s._replace(marked=np.ones_like(s.polygon)) for s in sights()]
-    assert weight(shown_beside(SCENE, OBJECT | RING, MAY, sights())) > 0.5
-    assert not shown_beside(SCENE, OBJECT | RING, MAY, marked).any()
+    assert weight(shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())[0]) > 0.5
+    assert not shown_beside(SCENE, OBJECT | RING, NONE, MAY, marked)[0].any()
 
 
 def test_large_photos_are_cut_small(monkeypatch: pytest.MonkeyPatch) -> None:
     large = sights(scale=2)
-    whole = shown_beside(SCENE, OBJECT | RING, MAY, large)
+    whole, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large)
     monkeypatch.setattr(beside, "LARGEST", 100)
-    small = shown_beside(SCENE, OBJECT | RING, MAY, large)
+    small, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large)
     assert weight(whole ^ small) < 0.15 and not small[OBJECT].any()
 
 
 def test_it_tells_the_same_each_time() -> None:
-    first, again = (shown_beside(SCENE, OBJECT | RING, MAY, sights()) for _ in range(2))
+    first, again = (shown_beside(SCENE, OBJECT | RING, RING, MAY, sights()) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
 @pytest.mark.parametrize("goes", [np.zeros(len(SCENE), bool), np.ones(len(SCENE), bool)])
 def test_photos_that_show_one_thing_only_are_no_error(goes: np.ndarray) -> None:
-    found = shown_beside(SCENE, goes, MAY, sights()[:2])
-    assert found.shape == goes.shape and not found[~MAY].any()
+    found, object_ = shown_beside(SCENE, goes, ~goes, MAY, sights()[:2])
+    assert found.shape == goes.shape == object_.shape and not found[~MAY].any()
 
 
 def test_without_views_nothing_is_shown() -> None:
-    assert not shown_beside(SCENE, OBJECT, MAY, []).any()
+    assert not np.any(shown_beside(SCENE, OBJECT, RING, MAY, []))
     empty = [s._replace(polygon=np.zeros_like(s.polygon)) for s in sights()]
-    assert not shown_beside(SCENE, OBJECT, MAY, empty).any()
+    assert not np.any(shown_beside(SCENE, OBJECT, RING, MAY, empty))

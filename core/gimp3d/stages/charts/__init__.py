@@ -35,7 +35,6 @@ from .find import (
     pixel_size,
     places_drawn,
 )
-from .find import INLIER as INLIER
 from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
 from .plane import Hits as Hits
