@@ -72,7 +72,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
     "a tenth of it is": (("clearing.observed", 0.1),),
     "colours do not tell the object from what is beside it": (
-        ("gimp3d.steps.behind:shown_beside", lambda scene, *_: np.zeros(len(scene), bool)),
+        ("gimp3d.steps.behind:shown_beside", lambda scene, *_: np.zeros((2, len(scene)), bool)),
     ),
     "what was left is not asked": (("gimp3d.steps.behind:LEFT", ()),),
     "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),
