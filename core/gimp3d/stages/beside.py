@@ -1,4 +1,7 @@
-"""Which Gaussians photos show to be surroundings, though depths and boxes took them for the object (docs/method.md)."""
+"""Which Gaussians photos show to be surroundings, though depths and boxes took them for the object, or the other way.
+
+docs/method.md, "Where views are filled".
+"""
 
 from __future__ import annotations
 
