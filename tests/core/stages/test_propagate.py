@@ -220,6 +220,19 @@ def test_the_level_is_met_where_the_hole_touches_no_photo(reference: Reference) 
     assert error(image, target, hole, darker) < 8
 
 
+def test_photo_of_places_that_no_photo_shows_tells_no_light(reference: Reference) -> None:
+    """Something stands there, whatever depths say: in a rough scan they do not tell it from the surface behind."""
+    target = view(reference, 2)
+    cols = np.nonzero(target.target)[1]
+    there = target.target & (np.arange(target.target.shape[1]) > (cols.min() + cols.max()) / 2)
+    left = target.target & ~there  # red
+    base = np.where(there[..., None], np.uint8(0), target.image)
+    half = replace(target, base=base, silhouette=there, target=there, depth_before=target.depth_new)
+    assert left.any() and (half.base[left] == [200, 0, 0]).all()
+    _, image, rules = paint(reference, half)
+    assert error(image, target, there & (rules == Rule.OWN_PIXELS)) < 7
+
+
 def test_what_the_reference_does_not_see_is_said_to_be_unreached(reference: Reference) -> None:
     target = view(reference, 2)
     shifted = replace(target, depth_new=0.6 * target.depth_new)
