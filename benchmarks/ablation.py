@@ -114,6 +114,12 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "the paper's sampling": (("propagate.transfer", "sample"),),
     "the paper's blend": (("propagate.blend", "rim"),),
     "the paper's sampling and its blend": (("propagate.transfer", "sample"), ("propagate.blend", "rim")),
+    "photo of places that no photo shows tells of light": (
+        (
+            "gimp3d.stages.propagate:_painted",
+            Around(lambda painted: lambda r, *p: painted(replace(r, source=r.source | r.target), *p)),
+        ),
+    ),
     "light differs by as much all round the hole": (("gimp3d.stages.propagate.blend:TOLERANCES", (1.0,)),),
     "the fill is as sharp as photos": (("gimp3d.stages.propagate.detail:BLURS", ()),),
     "the fill keeps the colours of its reference": (("gimp3d.stages.propagate.blend:TELLING", 1e9),),
