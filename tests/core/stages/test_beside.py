@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scenes import BLOCK, REGION, block, cameras, floor
@@ -81,6 +82,24 @@ def test_large_photos_are_cut_small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(beside, "LARGEST", 100)
     small, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large)
     assert weight(whole ^ small) < 0.15 and not small[OBJECT].any()
+
+
+def test_what_most_photos_show_as_the_object_is_so_for_certain_in_the_next_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each photo is cut twice, the second time at twice its size: what one cuts off wrongly, the others give back."""
+    first, certain, cuts = sights()[0], dict[float, int](), list[float]()
+    window = beside._window(first.polygon)
+
+    def cut(photo: np.ndarray, start: np.ndarray, size: float) -> np.ndarray:
+        wrong = np.array_equal(photo, first.photo[window])
+        if wrong:
+            certain[size] = int((start == cv2.GC_FGD).sum())
+        cuts.append(size)
+        return np.full(start.shape, not wrong)
+
+    monkeypatch.setattr(beside, "_cut", cut)
+    found, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
+    assert sorted(cuts) == [1] * len(sights()) + [2] * len(sights())
+    assert certain[2] > 1.1 * certain[1] and not found[OBJECT | RING].any()
 
 
 def test_it_tells_the_same_each_time() -> None:

@@ -16,8 +16,9 @@ from gimp3d.geometry import dilated
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.run import Run
 from gimp3d.stages import refine
+from gimp3d.stages.beside import Sight
 from gimp3d.stages.charts import pictured
-from gimp3d.stages.masks import find_masks
+from gimp3d.stages.masks import Masks, find_masks
 from gimp3d.stages.propagate import Rule
 from gimp3d.steps.behind import observed_round, take_painted_colours
 from gimp3d.steps.references import emptied
@@ -42,10 +43,15 @@ def views() -> tuple[View, ...]:
 
 
 @cache
-def behind() -> Behind:
+def found() -> tuple[Masks, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Masks, photos and marked shadows, of which there are none."""
     photos = {v.camera.id: v.image for v in views()}
-    masks = find_masks(spoilt(), REGION, [v.camera for v in views()], SETTINGS.masks, photos=photos)
-    return look_behind(Run(SETTINGS), spoilt(), REGION, masks, photos, {})
+    return find_masks(spoilt(), REGION, [v.camera for v in views()], SETTINGS.masks, photos=photos), photos, {}
+
+
+@cache
+def behind() -> Behind:
+    return look_behind(Run(SETTINGS), spoilt(), REGION, *found())
 
 
 def fidelity(gaussians: Gaussians) -> float:
@@ -56,6 +62,24 @@ def fidelity(gaussians: Gaussians) -> float:
         drawn = render_bytes(gaussians, view.camera)
         found.append(psnr(drawn, view.photo, dilated(place, 8) & ~place))
     return float(np.mean(found))
+
+
+def test_of_many_photos_some_are_cut_by_their_colours_as_far_apart_as_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[list[Sight]]()
+
+    def shown(scene: Gaussians, goes: np.ndarray, stays: np.ndarray, may: np.ndarray, sights: list[Sight]):
+        asked.append(sights)
+        return np.zeros((2, len(scene)), bool)
+
+    monkeypatch.setattr("gimp3d.steps.behind.shown_beside", shown)
+    monkeypatch.setattr("gimp3d.steps.behind.CUT", 3)
+    look_behind(Run(SETTINGS), spoilt(), REGION, *found())
+    centres = np.array([s.camera.centre for s in asked[0]])
+    assert len(asked[0]) == 3 and len(views()) == 9
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(3, 1)]
+    everyone = np.array([v.camera.centre for v in views()])
+    neighbours = np.sort(np.linalg.norm(everyone[:, None] - everyone, axis=-1), axis=1)[:, 1]
+    assert apart.min() > 1.5 * neighbours.max()
 
 
 def test_colours_round_the_object_become_those_of_photos() -> None:
