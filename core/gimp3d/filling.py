@@ -69,7 +69,7 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
 def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix: str) -> Completed | None:
     """One chart without its hole; None if no view needs it."""
     assert turn.chart is not None
-    by_photos, chart = chart.known, references.carried_over(chart, filling.done)
+    shown, chart = chart.shown, references.carried_over(chart, filling.done)
     target, hole = references.texels_to_fill(chart, turn.chart, filling.views)
     if not target.any():
         if turn.name:
@@ -78,7 +78,7 @@ def _complete_chart(run: Run, filling: Filling, chart: Chart, turn: Turn, suffix
     name = f"appearance{suffix}"
     appearance = run(name, references.paint_chart, chart, hole, turn, run.settings, run.call("--inpaint", name))
     run.warnings += appearance.warnings
-    return Completed(chart.camera, appearance.image, chart.depth, target, by_photos, (chart,))
+    return Completed(chart.camera, appearance.image, chart.depth, target, shown, (chart,))
 
 
 def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: Turn, suffix: str) -> Completed | None:
@@ -102,7 +102,8 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
     appearance = run(name, references.paint_view, view, charts, settings, turn.picture, run.call("--inpaint", name))
     run.warnings += appearance.warnings
     run.pictures += pictures.of_depth(completion, depth, view.left.target, view.id)
-    source = np.where(view.left.target, references.charted(view, charts)[1], ~view.left.silhouette & (depth > 0))
+    shown = False if view.hits is None else view.hits.of([c.shown for c in charts])
+    source = np.where(view.left.target, shown, ~view.left.silhouette & (depth > 0))
     return Completed(view.camera, appearance.image, depth, view.left.target, source, charts if rough else ())
 
 

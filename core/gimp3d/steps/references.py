@@ -160,21 +160,15 @@ def complete_view_depth(
     return complete_depth(disparity_of(masks.depth_after), known, masks.target, prior, continued)
 
 
-def charted(view: ViewState, charts: Sequence[Chart]) -> tuple[np.ndarray, np.ndarray]:
-    """What photos show of the charts where the view's target is, [H, W, 3] uint8, and where they do, [H, W] bool."""
-    if view.hits is None:
-        return view.painted, np.zeros_like(view.left.target)
-    shown, known, _ = pictured(charts, view.hits)
-    return shown, known & view.left.target
-
-
 def paint_view(
     view: ViewState, charts: Sequence[Chart], settings: RemovalSettings, picture: np.ndarray | None, call: Call
 ) -> Appearance:
     """The view without the object: the given picture, or what charts show and the provider's fill for the rest."""
-    masks = view.left
-    shown, seen = charted(view, charts)
-    base = np.where(seen[..., None], shown, view.painted)
+    masks, base, seen = view.left, view.painted, np.zeros(view.left.target.shape, bool)
+    if view.hits is not None:
+        shown, known, _ = pictured(charts, view.hits)
+        seen = masks.target & known
+        base = np.where(seen[..., None], shown, base)
     if picture is not None:
         return paste_picture(base, masks.target, picture, "--reference-image", ~masks.silhouette)
     hole, seed = masks.target & ~seen, settings.random_seed

@@ -69,6 +69,11 @@ class Chart(Facing, Laid):
     scatter: float  # relative z by which the views' drawn surfaces scatter about it
     tolerance: float  # the same, but never very small: within it a drawn surface is this one
 
+    @property
+    def shown(self) -> np.ndarray:
+        """[H, W] bool, where photos show it, whether they agree or not."""
+        return (self.photos > 0) & ~self.hole
+
 
 def chart_number(reference: str | None) -> int | None:
     """N of the reference chart:N, counted from 1; None for a view's ID."""

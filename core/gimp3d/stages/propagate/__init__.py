@@ -97,7 +97,7 @@ def _painted(
     warp = warp_reference(reference, near.camera, depth, hole | photo)
     reached = ~np.isnan(warp.u)
     painted, photo = hole & reached, photo & reached
-    photo[photo] = warp.lookup(reference.source, photo)  # elsewhere it shows something that rough depths do not tell
+    photo[photo] = warp.lookup(reference.source, photo)  # elsewhere something stands that rough depths do not tell
     rules = np.where(hole, Rule.UNREACHED, Rule.UNTOUCHED).astype(np.uint8)
     rules[painted] = Rule.REFERENCE if sample else Rule.OWN_PIXELS
     if sample:
