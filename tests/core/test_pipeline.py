@@ -52,6 +52,27 @@ def test_an_observer_sees_every_stage_in_order_with_what_it_takes_and_makes() ->
     assert all(stage.seconds >= 0 and stage.reason for stage in result.stages)
 
 
+@pytest.mark.parametrize("named", [False, True])
+def test_light_is_told_where_photos_show_the_reference_and_nowhere_in_a_hole(named: bool) -> None:
+    seen: dict[str, tuple[Any, ...]] = {}
+
+    def watch(name: str, work: Any, inputs: tuple[Any, ...]) -> Any:
+        seen[name] = inputs
+        return work(*inputs)
+
+    given = (views()[0].camera.id, views()[0].image) if named else (None, None)
+    remove_object(scene(), views(), REGION, PRESETS["draft"], *given, observer=watch)
+    completed, chart = seen["propagate"][0], seen["clear"][3][0]
+    if named:
+        hits = next(v.hits for v in seen["propagate"][2] if v.id == completed.camera.id)
+        shown = hits.of([chart.shown])
+        assert (completed.source == shown)[completed.target].all()
+    else:
+        assert (completed.source == chart.shown).all() and (completed.target & ~chart.hole & completed.source).any()
+    hole = hits.of([chart.hole]) if named else chart.hole
+    assert (hole & completed.target).sum() > 100 and not (hole & completed.source & completed.target).any()
+
+
 def test_an_observer_can_stand_in_for_a_stage() -> None:
     def in_red(name: str, work: Any, inputs: tuple[Any, ...]) -> Any:
         made = work(*inputs)
