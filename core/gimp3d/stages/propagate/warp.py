@@ -52,7 +52,7 @@ class Reference:
     image: np.ndarray  # [H, W, 3] uint8, inpainted
     depth: np.ndarray  # [H, W] float32, completed
     target: np.ndarray  # [H, W] bool, T_0
-    source: np.ndarray  # [H, W] bool, pixels that show a photo's unhidden surface
+    source: np.ndarray  # [H, W] bool, what photos show, the object not in the way, agreeing or not
 
 
 @dataclass(frozen=True)
