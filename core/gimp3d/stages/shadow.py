@@ -244,65 +244,72 @@ def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Se
 def find_contact(charts: Sequence[Chart]) -> Shadow | str:
     """The dark rims round the charts' holes; or why they count for none.
 
-    A texel beside the hole is compared with the nearest ones of its colour a little farther out. It is in the shadow
+    Each channel by itself: in place of the light that it blocks, the object gives off some in its own colour. A texel
+    beside the hole is compared with the nearest ones of its colour a little farther out. It is in the shadow
     if most of what lies as near to the hole as it does, and not far from it, is darker than there. Textures are dark by
     chance as well: as often where nothing stands, one width away.
     """
     found = [(c, *_rim(c)) for c in charts]
-    rims = [(chart, taken, share) for chart, taken, share, by_chance in found if share > CHANCE * max(by_chance, SOME)]
+    rims = [(chart, taken, share) for chart, taken, share in found if taken.any()]
     if not rims:
         return "no dark rim found where it touches a surface"
     share = max(share for _, _, share in rims)
     most = max(float(np.percentile(taken[taken > 0], 90)) for _, taken, _ in rims)
     words = f"a dark rim round {share:.0%} of its outline, where up to {most:.0%} of the light is missing"
     grounds = tuple(Ground(c.plane, c.camera, c.depth, c.there, c.image, c.known, c.hole) for c, _, _ in rims)
-    taken = tuple(np.repeat(t[..., None], 3, axis=-1).astype(np.float32) for _, t, _ in rims)
-    return Shadow(grounds, None, (), taken, share, 1 - 1 / CHANCE, words)
+    return Shadow(grounds, None, (), tuple(taken for _, taken, _ in rims), share, 1 - 1 / CHANCE, words)
 
 
-def _rim(chart: Chart) -> tuple[np.ndarray, float, float]:
-    """[H, W] the share of light that is taken, and of what share of the outline; and what chance makes of that."""
+def _rim(chart: Chart) -> tuple[np.ndarray, float]:
+    """[H, W, 3] float32 the share of light that is taken, and of what share of the outline; as far as it is more than
+    what chance makes of that."""
     width = max(LEAST_WIDTH, WIDTH * float(np.sqrt(chart.hole.sum())))
     # what photos show beside the hole only where they may show the object as well counts as hole
     unseen = chart.hole | (chart.there & (chart.photos == 0))
     near = cv2.distanceTransform((~chart.hole).astype(np.uint8), cv2.DIST_L2, 5) <= width
     hole = chart.hole | (near & scipy.ndimage.binary_propagation(chart.hole, mask=unseen))
     far = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-    logs = np.log(linear(chart.image) + DARK)
-    luminance, hue = np.log(np.exp(logs).mean(-1)), logs[..., [0, 2]] - logs[..., 1:2]
+    logs = np.log(linear(chart.image) + DARK).astype(np.float32)
+    hue = logs[..., [0, 2]] - logs[..., 1:2]
     shown = chart.there & (chart.photos > 0) & ~hole
 
     def darker(start: float) -> tuple[np.ndarray, np.ndarray]:
-        """Texels within a width of a distance, and by how much they are brighter than those beyond."""
+        """Texels within a width of a distance, and by how much they are brighter than those beyond, [H, W, 3]."""
         here = shown & (far > start) & (far <= start + width)
         beyond = shown & (far > start + width) & (far <= start + 2.5 * width)
-        change = np.zeros(far.shape, np.float32)
+        change = np.zeros(logs.shape, np.float32)
         if here.any() and beyond.sum() >= COMPARED:
             places = [np.column_stack([np.argwhere(on) / width, hue[on] / LIKE]) for on in (beyond, here)]
             nearest = cKDTree(places[0]).query(places[1], k=COMPARED)[1]
-            change[here] = luminance[here] - np.median(luminance[beyond][nearest], axis=1)
+            change[here] = logs[here] - np.median(logs[beyond][nearest], axis=1)
         return here, change
 
     elsewhere, by_chance = darker(width)
+    here, changes = darker(0.0)
+    taken, most = np.zeros(logs.shape, np.float32), 0.0
     if not elsewhere.any():
-        return np.zeros(far.shape), 0.0, 1.0
-    limit = max(VISIBLE, 1.4826 * float(np.median(np.abs(by_chance[elsewhere]))))
-    here, change = darker(0.0)
+        return taken, most
     outside = elsewhere & (far <= width + width / STRIPS)
-    level, inside = np.zeros(far.shape, np.float32), hole
-    for k in range(STRIPS):
-        strip = here & (far > k * width / STRIPS) & (far <= (k + 1) * width / STRIPS)
-        dark, mean = _mostly_dark(strip, change, limit, width)
-        inside = dark & dilated(inside, max(1, round(width / STRIPS)))
-        level[inside] = mean[inside]
-        if k == 0:
-            share = float(inside.sum() / max(1, strip.sum()))
-    chance = float(_mostly_dark(outside, by_chance, limit, width)[0].sum() / max(1, outside.sum()))
-    # without steps, and beside the object so much that it is filled
-    taken = 1 - np.exp(cv2.GaussianBlur(level, (0, 0), width / (2 * STRIPS)))
-    filled = hole & dilated(level < 0, round(width))
+    filled = np.zeros_like(hole)
+    for channel in range(3):
+        change, usual = changes[..., channel], by_chance[..., channel]
+        limit = max(VISIBLE, 1.4826 * float(np.median(np.abs(usual[elsewhere]))))
+        level, inside, share = np.zeros(far.shape, np.float32), hole, 0.0
+        for k in range(STRIPS):
+            strip = here & (far > k * width / STRIPS) & (far <= (k + 1) * width / STRIPS)
+            dark, mean = _mostly_dark(strip, change, limit, width)
+            inside = dark & dilated(inside, max(1, round(width / STRIPS)))
+            level[inside] = mean[inside]
+            if k == 0:
+                share = float(inside.sum() / max(1, strip.sum()))
+        chance = float(_mostly_dark(outside, usual, limit, width)[0].sum() / max(1, outside.sum()))
+        if share > CHANCE * max(chance, SOME):
+            # without steps, and beside the object so much that it is filled
+            taken[..., channel] = 1 - np.exp(cv2.GaussianBlur(level, (0, 0), width / (2 * STRIPS)))
+            filled |= hole & dilated(level < 0, round(width))
+            most = max(most, share)
     taken[filled] = np.maximum(taken[filled], TOO_DARK)
-    return taken, share, chance
+    return taken, most
 
 
 def _mostly_dark(strip: np.ndarray, change: np.ndarray, limit: float, width: float) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -259,12 +259,16 @@ ROUND = (Box.make([0, 0, 0.25], [0.5] * 3),)
 Painted = Callable[[np.ndarray, np.ndarray], np.ndarray]  # x, y [H, W] in texels → linear colour [H, W, 3]
 
 
-def chart_of(paint: Painted, taken: Callable[[np.ndarray], np.ndarray] = np.zeros_like) -> Chart:
-    """A chart with a square hole; `taken` is the share of light that is missing at a distance from it, in texels."""
+def chart_of(
+    paint: Painted, taken: Callable[[np.ndarray], np.ndarray] = np.zeros_like, tint: Sequence[float] = (1, 1, 1)
+) -> Chart:
+    """A chart with a square hole; `taken` is the share of light that is missing at a distance from it, in texels, by
+    `tint` more or less in each channel."""
     y, x = np.indices((SIDE, SIDE)).astype(float)
     hole = np.maximum(np.abs(x - SIDE / 2), np.abs(y - SIDE / 2)) < HOLE / 2
-    light = 1 - taken(cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5).astype(float))
-    image = np.rint(255 * encoded(np.clip(paint(x, y) * light[..., None], 0, 1))).astype(np.uint8)
+    away = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5).astype(float)
+    light = 1 - taken(away)[..., None] * tint
+    image = np.rint(255 * encoded(np.clip(paint(x, y) * light, 0, 1))).astype(np.uint8)
     camera = Camera("chart:1", SIDE, SIDE, 500.0, 500.0, SIDE / 2, SIDE / 2, np.eye(4))
     plane = Plane.make(np.zeros(3), np.array([0.0, 0, 1]), ROUND)
     no, photos = np.zeros_like(hole), np.where(hole, 0, 9).astype(np.uint16)
@@ -318,6 +322,20 @@ def test_a_dark_rim_is_found_and_as_dark_as_it_is(paint: Painted) -> None:
     assert taken[far > 12].max() < 0.02
 
 
+@pytest.mark.parametrize("paint", [even, noise, boards])
+def test_a_rim_has_the_colour_of_what_the_object_gives_back(paint: Painted) -> None:
+    """Yellow takes blue light alone."""
+    tint = np.array([0.0, 0.1, 1.0])
+    found = find_contact([chart_of(paint, foot, tint)])
+    assert isinstance(found, Shadow), found
+    ground, (taken,) = found.grounds[0], found.taken
+    far = cv2.distanceTransform((~ground.hole).astype(np.uint8), cv2.DIST_L2, 5)
+    for near, beyond in ((1, 2), (2, 4)):
+        ring = (far > near) & (far <= beyond) & ~ground.hole
+        off = np.median(taken[ring], axis=0) - np.median(foot(far[ring])) * tint
+        assert np.abs(off).max() < 0.1, (near, off)
+
+
 @pytest.mark.parametrize("paint", [even, noise, boards, waves, carpet])
 def test_what_is_dark_by_chance_is_no_rim(paint: Painted) -> None:
     assert "no dark rim" in str(find_contact([chart_of(paint)]))
@@ -341,13 +359,14 @@ def test_without_a_surface_round_the_hole_there_is_none() -> None:
 
 
 @cache
-def standing(paint: Callable[[np.ndarray], np.ndarray]) -> LitScene:
-    """A block on a floor that is dark within a few texels of its foot, as in no lamp's shadow."""
+def standing(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...]) -> LitScene:
+    """A block on a floor that is dark within a few texels of its foot, as in no lamp's shadow; more or less in each
+    channel."""
 
     def dark_at_the_foot(points: np.ndarray) -> np.ndarray:
         beside = np.maximum(np.abs(points[:, :2]) - BLOCK / 2, 0)
-        light = 1 - 0.6 * np.exp(-((np.hypot(*beside.T) / 0.05) ** 2))
-        return encoded(linear_of(paint(points)) * light[:, None])
+        light = 1 - 0.6 * np.exp(-((np.hypot(*beside.T) / 0.05) ** 2))[:, None] * tint
+        return encoded(linear_of(paint(points)) * light)
 
     return make_scene("foot", [], dark_at_the_foot, casts=False)
 
@@ -356,9 +375,9 @@ def linear_of(colours: np.ndarray) -> np.ndarray:
     return linear(np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8))
 
 
-@pytest.mark.parametrize("paint", [grain, plain])
-def test_the_rim_goes_with_the_object(paint: Callable[[np.ndarray], np.ndarray]) -> None:
-    scene, truth = standing(paint), make_scene("bare", [], paint, casts=False).truth
+@pytest.mark.parametrize(("paint", "tint"), [(grain, (1, 1, 1)), (plain, (1, 1, 1)), (grain, (0, 0.2, 1))])
+def test_the_rim_goes_with_the_object(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...]) -> None:
+    scene, truth = standing(paint, tint), make_scene("bare", [], paint, casts=False).truth
     seen = [View(c, render_bytes(scene.gaussians, c)) for c in scene.cameras(24, 480, 360)]
     result = remove_object(scene.gaussians, seen, scene.region, PRESETS["draft"])
     assert result.shadow["found"] and "dark rim" in result.shadow["reason"], result.shadow["reason"]
@@ -366,8 +385,10 @@ def test_the_rim_goes_with_the_object(paint: Callable[[np.ndarray], np.ndarray])
     final = final if result.added is None else final.extended(result.added)
     left, before = [], []
     for view in seen[::4]:
-        true, shown = (np.log(linear(render_bytes(g, view.camera)).mean(-1) + 4e-3) for g in (truth, final))
-        photo = np.log(linear(view.image).mean(-1) + 4e-3)
+        true, shown, photo = (
+            np.log(linear(picture) + 4e-3)[..., np.argmax(tint)]
+            for picture in (render_bytes(truth, view.camera), render_bytes(final, view.camera), view.image)
+        )
         block = view.image[..., 0].astype(int) - view.image[..., 1] > 70
         rim = (photo - true < -0.15) & (cv2.dilate(block.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0)
         before.append((photo - true)[rim])
