@@ -88,13 +88,10 @@ def cameras(count: int = 9, width: int = 120, height: int = 90) -> tuple[Camera,
 
 
 def charts_of(
-    planes: Sequence[Plane],
-    witnesses: Sequence[Witness],
-    settings: ChartSettings = ChartSettings(),
-    marked: Sequence[np.ndarray] = (),
+    planes: Sequence[Plane], witnesses: Sequence[Witness], settings: ChartSettings = ChartSettings()
 ) -> tuple[Chart, ...]:
     """What photos show at planes round the block."""
-    return draw_charts(lay_planes(planes, witnesses, REGION, settings), witnesses, REGION, marked)
+    return draw_charts(lay_planes(planes, witnesses, REGION, settings), witnesses, REGION)
 
 
 def charted(

@@ -128,7 +128,7 @@ def chart_targets(
     What the scene, emptied, shows clearly before a chart is not filled: other photos saw it.
     """
     removed, tolerance = selection.removed, max(c.tolerance for c in charts)
-    gone, open_ = scene.take(removed), [c.hole | c.below for c in charts]
+    gone, holes = scene.take(removed), [c.hole for c in charts]
 
     def of(k: int) -> tuple[ViewMasks, Hits]:
         view, hidden = views[k], witnesses[k].hidden
@@ -137,7 +137,7 @@ def chart_targets(
         with_object = view.depth_before, view.alpha_before
         depth, alpha = (np.where(window, a, b) for a, b in zip(drawn.surface_depth(gone=removed), with_object))
         hits = first_hits(charts, view.camera, window)
-        unseen, met = hits.of(open_), hits.depth > 0
+        unseen, met = hits.of(holes), hits.depth > 0
         before = (alpha >= SURFACE) & hits.behind(depth, tolerance)
         gone_from = hidden | (drawn.footprint(removed) > TOUCHED)
         target = (hidden & unseen & ~before) | (gone_from & met & (alpha < SURFACE) & (view.alpha_before >= SURFACE))

@@ -139,7 +139,7 @@ class Charted:
 
 def chart_surfaces(region: Region, surfaces: Surfaces, views: Sequence[ViewState]) -> Charted:
     """Show the hidden surfaces."""
-    charts = draw_charts(surfaces.laid, surfaces.witnesses(views, wary=True), region, surfaces.marked)
+    charts = draw_charts(surfaces.laid, surfaces.witnesses(views, wary=True), region)
     words = [f"{c.kind}: {c.reason}, {int(c.hole.sum())} texels that no photo shows" for c in charts]
     if not charts:
         return Charted((), 0.0, "no surface runs into what the object hid")

@@ -277,7 +277,7 @@ def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> No
         flat = stage._placed(plane, REGION, seen.witnesses, 200)
         assert flat is not None
         laid = find.Laid(flat.plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
-        chart, _ = stage._chart(laid, REGION, seen.witnesses, ())
+        chart, _ = stage._chart(laid, REGION, seen.witnesses)
         points = texels(chart).reshape(*chart.depth.shape, 3)
         on_floor = np.abs(points[..., 2]) < 0.01
         on_wall = np.abs(points[..., 1] - 0.4) < 0.01
@@ -339,9 +339,9 @@ def test_a_chart_shows_the_floor_and_nothing_in_its_hole(floor_room: Room, floor
     c = floor_chart
     assert c.kind == "plane" and c.there.all() and c.agreement > 0.9 and c.noise < 1e-5
     assert np.abs(c.image[c.known] - texture(texels(c)).reshape(c.image.shape)[c.known]).max() < 4
-    assert not (c.known & c.hole).any() and not (c.below & c.hole).any()
+    assert not (c.known & c.hole).any()
     said = ask(floor_room.witnesses, texels(c), c.tolerance).reshape(-1, *c.depth.shape)
-    np.testing.assert_array_equal(c.photos[~c.below], (said == Says.SEEN).sum(0)[~c.below])
+    np.testing.assert_array_equal(c.photos, (said == Says.SEEN).sum(0))
     shown = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0)
     assert (c.hole & ~shown).sum() > 500 and not c.image[c.hole].any()
     assert c.camera.id == "chart:1" and c.camera.forward @ UP == pytest.approx(-1)
@@ -370,74 +370,6 @@ def area(chart: Chart, mask: np.ndarray) -> float:
     return float(mask.sum()) * (chart.depth[0, 0] / chart.camera.fx) ** 2
 
 
-TOO_WIDE = 16  # px; a ring of some ten texels or less stays hole
-
-
-@pytest.fixture(scope="module")
-def wide(floor_room: Room) -> list[Witness]:
-    """Masks too large on all sides: below them photos show floor."""
-    side = 2 * TOO_WIDE + 1
-    masks = [cv2.dilate(w.hidden.astype(np.uint8), np.ones((side, side))) > 0 for w in floor_room.witnesses]
-    return [replace(w, hidden=m, beside=w.beside & ~m) for w, m in zip(floor_room.witnesses, masks)]
-
-
-@pytest.fixture(scope="module")
-def wide_chart(floor_room: Room, wide: list[Witness]) -> Chart:
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], wide)
-    return chart
-
-
-def test_of_a_mask_that_is_too_large_little_more_than_the_object_stays_hole(
-    floor_chart: Chart, wide: list[Witness], wide_chart: Chart
-) -> None:
-    c = wide_chart
-    true = area(floor_chart, floor_chart.hole)
-    assert area(c, unseen(c, wide)) > 3 * true  # as far as the masks tell
-    assert area(c, c.hole) < 1.5 * true  # measured: 1.28
-    certain = hidden_everywhere(EYES, texels(c), 0.0).reshape(c.hole.shape)
-    assert certain.sum() > 500 and c.hole[certain].all()
-    assert (c.below & unseen(c, wide)).sum() > 2000 and (c.known & (c.photos > 1))[c.below].all()
-    assert not (c.below & c.hole).any()
-    assert np.abs(c.image[c.below] - texture(texels(c)).reshape(c.image.shape)[c.below]).max() < 20  # floor, not red
-
-
-def test_what_is_known_from_below_the_mask_is_no_hole(floor_room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
-    floor = Plane.make(np.zeros(3), UP, REGION)
-    taken = []
-
-    def told(shown: stage._Shown, *_: np.ndarray) -> tuple[np.ndarray, ...]:
-        right = shown.hole & (np.arange(shown.hole.shape[1]) > np.median(np.nonzero(shown.hole)[1]))
-        taken.append(right)
-        return right.copy(), np.zeros_like(right), np.zeros_like(right)
-
-    monkeypatch.setattr(stage, "_told_by_colours", told)
-    (chart,) = charts_of([floor], floor_room.witnesses)
-    assert taken[0].sum() > 100 and chart.below[taken[0]].all() and not chart.hole[taken[0]].any()
-
-
-def test_what_photos_disagree_on_below_the_mask_stays_hole(
-    floor_room: Room, wide: list[Witness], wide_chart: Chart
-) -> None:
-    """Though it has the floor's colours: each photo shows another part of the floor there."""
-    other = [
-        replace(w, photo=np.where((w.hidden & ~narrow.hidden)[..., None], w.photo[::-1], w.photo))
-        for w, narrow in zip(wide, floor_room.witnesses)
-    ]
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], other)
-    assert chart.hole[wide_chart.below].mean() > 0.8  # measured: 1
-
-
-def test_a_plain_colour_below_the_mask_stays_hole(
-    floor_room: Room, wide: list[Witness], wide_chart: Chart, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An object of one colour looks alike in all photos, wherever they meet, and if it is the floor's none tells."""
-    grey = [np.where(w.hidden[..., None], np.uint8(120), w.photo) for w in wide]
-    monkeypatch.setattr(stage, "shows_object", lambda picture, *_: np.zeros(picture.shape[:2], bool))
-    plain = [replace(w, photo=photo) for w, photo in zip(wide, grey)]
-    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], plain)
-    assert chart.hole[wide_chart.below].all()
-
-
 def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
     floor_room: Room, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -457,20 +389,6 @@ def test_a_loud_texture_that_photos_show_a_little_beside_its_place_is_copied(
         stripes = (texels(chart)[:, 0] > 0.4).reshape(chart.hole.shape) & chart.there & ~chart.hole & (chart.photos > 1)
         known.append(chart.known[stripes].mean())
     assert known[0] > 0.9 and known[1] < 0.5
-
-
-def test_what_is_marked_stays_hole_though_photos_agree_below_the_mask(
-    floor_room: Room, wide: list[Witness], wide_chart: Chart
-) -> None:
-    left = np.arange(240) < 120
-    marks = [w.hidden & left & (k == 0) for k, w in enumerate(wide)]  # in one view
-    plane = Plane.make(np.zeros(3), UP, REGION)
-    (chart,) = charts_of([plane], wide, ChartSettings(), marks)
-    on = sees(EYES[0], marks[0], texels(chart), np.inf).reshape(chart.hole.shape)
-    assert (wide_chart.below & on).sum() > 500 and chart.hole[wide_chart.below & on].all()
-    apart = cv2.dilate(on.astype(np.uint8), np.ones((17, 17))) == 0
-    assert (wide_chart.below & apart).sum() > 500
-    np.testing.assert_array_equal(chart.hole[apart], wide_chart.hole[apart])
 
 
 def test_charts_keep_to_the_size_asked_for(floor_room: Room, floor_chart: Chart) -> None:
@@ -553,7 +471,7 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     plane = Plane(offset * normal, axes[0], axes[1], normal)
     there = np.ones((h, w), bool)
     laid, shown = (plane, camera, depth, "plane", 1.0, 0.0, (), ""), (there, grey, no, no)
-    return Chart(*laid, *shown, no.astype(np.uint16), no, no, scatter=0.0, tolerance=0.01)
+    return Chart(*laid, *shown, no.astype(np.uint16), no, scatter=0.0, tolerance=0.01)
 
 
 def rays_of(camera: Camera) -> np.ndarray:
@@ -670,8 +588,8 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     known[disputed] = False
     colours = np.where(red[..., None], [190.0, 40, 40], [170.0, 130, 90]) + rng.normal(0, 5, (*shape, 3))
     image, photos = np.clip(colours, 0, 255).astype(np.uint8), np.where(hole, 0, 5).astype(np.uint16)
-    shown = stage._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, ~no, np.zeros(no.shape))
-    _, rests, foreign = stage._told_by_colours(shown, image[hole], no, no)
+    shown = stage._Shown(~no, image, photos, np.uint16(5) - photos, known, known, hole, np.zeros(no.shape))
+    rests, foreign = stage._told_by_colours(shown, image[hole], no)
     assert rests[agreed].all() and not rests[disputed].any() and rests[speck]
     assert foreign[disputed].all() and not foreign[known].any()
     assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed
@@ -699,7 +617,7 @@ def test_mixed_pixels_beside_the_object_are_unlike_all_of_the_surface_near_by(gr
 
     def mixed(photos: int, hiding: int) -> np.ndarray:
         shown, hidden = (np.where(hole, 0, n).astype(np.uint16) for n in (photos, hiding))
-        described = stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, ~no, np.zeros(no.shape))
+        described = stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, np.zeros(no.shape))
         return stage._mixed(described, hole, beside)
 
     found = mixed(2, 5)

@@ -295,22 +295,6 @@ def test_targets_hold_the_charts_holes(plain: Removal, charts: tuple[Chart, ...]
         assert not (view.target & before).any()
 
 
-def test_what_is_known_only_from_below_the_mask_is_filled_too(charts: tuple[Chart, ...]) -> None:
-    """With what photos show: the floor's splats under the block, which a trainer guessed, do not show that."""
-    whole = floor(with_hole=False)
-    given = removal(whole.take((np.abs(whole.means[:, :2]) <= BLOCK / 2).all(1)))
-    (chart,) = charts
-    right = chart.hole & (np.arange(chart.hole.shape[1]) > chart.hole.shape[1] / 2)
-
-    def target(chart: Chart) -> np.ndarray:
-        rest = given.scene, given.selection, given.views, given.witnesses
-        return np.array([v.target for v, _ in chart_targets(*rest, (chart,), [NONE] * len(EYES))])
-
-    left = replace(chart, hole=chart.hole & ~right)
-    np.testing.assert_array_equal(target(replace(left, below=right)), target(chart))
-    assert target(left).sum() < 0.7 * target(chart).sum()
-
-
 def test_what_stays_before_the_floor_is_not_filled(charts: tuple[Chart, ...], targets: Targets) -> None:
     """A board within the block that other photos saw, and pixels of a surface in front of the block."""
     given = removal(discs(np.array([[0, 0, 0.3]]), (0, 0, 1), np.full((1, 3), 0.5), 0.09))

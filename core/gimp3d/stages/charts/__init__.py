@@ -16,7 +16,7 @@ import scipy.ndimage
 
 from ...box import Region, in_region
 from ...compute.threads import parallel_map
-from ...geometry import dilated, framed, sees
+from ...geometry import dilated, framed
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import CHART as CHART
@@ -64,7 +64,6 @@ class Chart(Facing, Laid):
     """A surface seen straight on, its object left out; arrays [H, W] of its camera."""
 
     photos: np.ndarray  # uint16, how many show it
-    below: np.ndarray  # bool, known only from what the object's rough mask covers
     rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
     scatter: float  # relative z by which the views' drawn surfaces scatter about it
     tolerance: float  # the same, but never very small: within it a drawn surface is this one
@@ -100,13 +99,9 @@ def lay_planes(
     return tuple(laid(flat) for flat in flats if flat is not None)
 
 
-def draw_charts(
-    laid: Sequence[Laid], witnesses: Sequence[Witness], region: Region, marked: Sequence[np.ndarray] = ()
-) -> tuple[Chart, ...]:
-    """What photos show of the surfaces at the planes; those without a hole are left out. Pixels of the witnesses' views
-    that are `marked`, [H, W] bool each, are to be filled whatever they show.
-    """
-    charts = _parted([_chart(one, region, witnesses, marked) for one in laid], witnesses)
+def draw_charts(laid: Sequence[Laid], witnesses: Sequence[Witness], region: Region) -> tuple[Chart, ...]:
+    """What photos show of the surfaces at the planes; those without a hole are left out."""
+    charts = _parted([_chart(one, region, witnesses) for one in laid], witnesses)
     bounded = [c for c in (_bounded(c, charts) for c in charts) if c.hole.any()]
     return tuple(replace(c, camera=replace(c.camera, id=f"chart:{k + 1}")) for k, c in enumerate(bounded))
 
@@ -171,19 +166,16 @@ class _Shown:
     """What photos show of a surface, as far as the object's masks tell; arrays [H, W]."""
 
     there: np.ndarray  # bool
-    image: np.ndarray  # [H, W, 3] uint8; in the hole it is what they show below the masks
+    image: np.ndarray  # [H, W, 3] uint8; in the hole it is what they show of the object
     photos: np.ndarray  # uint16, how many show it
     hiding: np.ndarray  # uint16, in how many the object's mask covers it
     known: np.ndarray  # bool
     alike: np.ndarray  # bool, known without allowing for misplaced texture
     hole: np.ndarray  # bool
-    alike_below: np.ndarray  # bool, below the masks they have a texture in common, and differ no more than elsewhere
     spread: np.ndarray  # float32, grey levels by which photos' textures differ; NaN where fewer than two show it
 
 
-def _chart(
-    laid: Laid, region: Region, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]
-) -> tuple[Chart, np.ndarray]:
+def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Chart, np.ndarray]:
     """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
     points, shape = laid.points(), laid.depth.shape
     texels = points.reshape(-1, 3)
@@ -193,18 +185,15 @@ def _chart(
     tolerance = max(TOLERANCE, scatter)
     shown = _shown(points, laid.plane, witnesses, tolerance, told)
     colours = _object_colours(laid.plane, witnesses, tolerance)
-    inside, filled = in_region(region, texels).reshape(shape), _marked(texels, witnesses, marked).reshape(shape)
-    below, rests, foreign = _told_by_colours(shown, colours, inside, filled)
-    hole = (shown.hole & ~below) | rests
-    below &= ~hole
+    rests, foreign = _told_by_colours(shown, colours, in_region(region, texels).reshape(shape))
+    hole = shown.hole | rests
     chart = Chart(
         **vars(laid),
         there=shown.there,
         image=np.where(hole[..., None], np.uint8(0), shown.image),
-        known=(shown.known | below) & ~hole & ~foreign,
+        known=shown.known & ~hole & ~foreign,
         hole=hole,
-        photos=np.where(below, shown.hiding, shown.photos),
-        below=below,
+        photos=shown.photos,
         rests=rests,
         scatter=scatter,
         tolerance=tolerance,
@@ -280,36 +269,29 @@ def _shown(
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
     hole |= there & (photos > 0) & ~alike & (hiding > photos)
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
-    below, spread_below, loud_below = mosaic(points, plane.normal, witnesses, beneath)
-    # what has one colour looks alike wherever photos meet: they agree where they share more than they differ by
-    alike_below = (spread_below <= limit) & (spread_below < loud_below)
     several = there & (photos > 1) & ~hole
     known = several & (spread <= limit + MISPLACED * loud)
-    image = np.where(hole[..., None], below, image)
+    image = np.where(hole[..., None], mosaic(points, plane.normal, witnesses, beneath)[0], image)
     spread = np.where(several, spread, np.float32(np.nan))
-    return _Shown(there, image, photos, hiding, known, several & alike, hole, alike_below, spread)
+    return _Shown(there, image, photos, hiding, known, several & alike, hole, spread)
 
 
-def _told_by_colours(
-    s: _Shown, object_colours: np.ndarray, inside: np.ndarray, marked: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Chart.below and Chart.rests, [H, W] bool: the object's mask is rough, too large here and too small there. And
-    what looks like the object, though photos do not agree that it lies there: it stands before the surface.
+def _told_by_colours(s: _Shown, object_colours: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Chart.rests, [H, W] bool: the object's mask is rough, and too small here and there. And what looks like the
+    object, though photos do not agree that it lies there: it stands before the surface.
 
-    Where photos agree below it, and on the surface's colours, they show the surface. Texels right beside the object's
-    mix with it. `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the region, or `marked`.
+    Texels right beside the object's mix with it. `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the
+    region.
     """
     far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
     doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
     around = s.alike & ~doubtful & (far < math.sqrt(s.hole.sum()))
     object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
-    below = (s.hole & ~dilated(object_, MIXED) & (s.hiding > 1) & s.alike_below & ~marked).astype(np.uint8)
-    below = cv2.morphologyEx(below, cv2.MORPH_OPEN, np.ones((SOFT + 1,) * 2, np.uint8)) > 0
     rests = object_ & s.alike  # photos would not agree on something else that stands there
     spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
     rests = (rests | dilated(spots, MIXED)) & (s.photos > 0)
-    hole = (s.hole & ~below) | rests
-    return below, rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0)), object_ & ~s.alike
+    hole = s.hole | rests
+    return rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0)), object_ & ~s.alike
 
 
 def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
@@ -369,15 +351,6 @@ def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float
         return witness.photo[witness.hidden & (witness.depth > 0) & before]
 
     return np.concatenate(parallel_map(of, witnesses))
-
-
-def _marked(points: np.ndarray, witnesses: Sequence[Witness], marked: Sequence[np.ndarray]) -> np.ndarray:
-    """[N] bool: points [N, 3] that the user marked in some view."""
-    found = np.zeros(len(points), bool)
-    for witness, mask in zip(witnesses, marked):
-        if mask.any():
-            found |= sees(witness.camera, mask.astype(np.float32), points, np.inf)
-    return found
 
 
 def _before(surface: np.ndarray, others: Sequence[Plane]) -> np.ndarray:
