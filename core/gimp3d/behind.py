@@ -84,9 +84,9 @@ def look_behind(
         if isinstance(found.shadow, str) and settings.shadow == "mask":
             run.warnings.append(found.shadow)
     lit, bounded, charted = in_light(found)
-    if isinstance(found.shadow, str) and settings.shadow == "auto":
+    if settings.shadow != "off":
         found = run("contact", with_contact, found, charted.charts)
-        if isinstance(found.shadow, str):
+        if isinstance(found.contact, str):
             lit = replace(found, lifted=lit.lifted)
         else:
             lit, bounded, charted = in_light(found, " 2")

@@ -56,9 +56,9 @@ def lift(
     removed: np.ndarray,  # [N] bool, the object
     witnesses: Sequence[Witness],
     reflection: Reflection | str | None,  # words, or None: there is none
-    shadow: Shadow | str | None,  # one of them at least
+    shadows: Sequence[Shadow] = (),  # one after the other; one of all at least
 ) -> Lifted:
-    """Subtract the reflection's light, then divide by the share of light that arrives: in photos, and in the Gaussians
+    """Subtract the reflection's light, then divide by the shares of light that arrive: in photos, and in the Gaussians
     that they show there.
 
     Trained splats hold reflections in what lies below the surface, in how its colours change with the view, or both:
@@ -68,7 +68,7 @@ def lift(
     if isinstance(reflection, Reflection):
         bare = partial(bare_photos, reflection)
         steps.append((reflection.confidence, bare, scene.sh_degree, "show its reflection"))
-    if isinstance(shadow, Shadow):
+    for shadow in shadows:
         steps.append((shadow.confidence, partial(lifted_photos, shadow), 0, "lie in its shadow"))
     before, sh, rows, words = tuple(w.photo for w in witnesses), scene.sh.copy(), np.zeros(0, int), []
     shaded = tuple(np.zeros_like(w.hidden) for w in witnesses)

@@ -178,12 +178,13 @@ class Relit:
     """What the object does to the light round it; in words, why it seems to do nothing. Undone, once it is lifted."""
 
     reflection: Reflection | str
-    shadow: Shadow | str
+    shadow: Shadow | str  # that lamps cast, or that is marked
+    contact: Shadow | str = ""  # what the object keeps from its foot of light from all sides; nobody asked: ""
     lifted: Lifted | None = None
 
     @property
     def effects(self) -> list[Reflection | Shadow]:
-        return [f for f in (self.shadow, self.reflection) if not isinstance(f, str)]
+        return [f for f in (self.shadow, self.contact, self.reflection) if not isinstance(f, str)]
 
     @property
     def confidence(self) -> float:
@@ -191,15 +192,15 @@ class Relit:
 
     @property
     def reason(self) -> str:
-        return "; ".join(f if isinstance(f, str) else f.reason for f in (self.shadow, self.reflection))
+        return _words(self.shadow, self.contact, self.reflection)
 
     def facts(self) -> dict[str, Any]:
-        """For the summary, by name: see Shadow.facts and Reflection.facts."""
-        found = {"shadow": self.shadow, "reflection": self.reflection}
-        return {
-            name: {**NOTHING[name], "reason": f} if isinstance(f, str) else {**f.facts(), "reason": f.reason}
-            for name, f in found.items()
-        }
+        """For the summary, by name: see Shadow.facts and Reflection.facts; without a lamp's shadow its foot's is told."""
+        shadow = self.contact if isinstance(self.shadow, str) else self.shadow
+        told = {"shadow": shadow, "reflection": self.reflection}
+        facts = {name: NOTHING[name] if isinstance(f, str) else f.facts() for name, f in told.items()}
+        reasons = {"shadow": _words(self.shadow, self.contact), "reflection": _words(self.reflection)}
+        return {name: {**of, "reason": reasons[name]} for name, of in facts.items()}
 
     def scene(self, scene: Gaussians) -> Gaussians:
         """The scene in its new light."""
@@ -218,6 +219,10 @@ class Relit:
 
 
 NOT_LIT = Relit("not looked for", "not looked for")
+
+
+def _words(*found: Shadow | Reflection | str) -> str:
+    return "; ".join(filter(None, (f if isinstance(f, str) else f.reason for f in found)))
 
 
 def find_light(
@@ -248,14 +253,14 @@ def find_light(
 
 
 def undo_light(scene: Gaussians, surfaces: Surfaces, views: Sequence[ViewState], found: Relit) -> Lifted:
-    """Subtract the reflection, then lift the shadow, in photos and in splats; one of them at least is found."""
-    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, found.shadow)
+    """Subtract the reflection, then lift the shadows, in photos and in splats; one of them at least is found."""
+    shadows = [s for s in (found.shadow, found.contact) if isinstance(s, Shadow)]
+    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, shadows)
 
 
 def with_contact(found: Relit, charts: Sequence[Chart]) -> Relit:
-    """The same with the shadow where the object touches a surface: where none of a lamp was found."""
-    shadow = find_contact(charts)
-    return replace(found, shadow=f"{found.shadow}; {shadow}" if isinstance(shadow, str) else shadow)
+    """The same with the shadow where the object touches a surface, as charts show it that are lifted by the others."""
+    return replace(found, contact=find_contact(charts))
 
 
 @dataclass(frozen=True)

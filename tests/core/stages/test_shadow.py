@@ -359,8 +359,8 @@ def test_without_a_surface_round_the_hole_there_is_none() -> None:
 
 
 @cache
-def standing(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...]) -> LitScene:
-    """A block on a floor that is dark within a few texels of its foot, as in no lamp's shadow; more or less in each
+def standing(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...], lamps: tuple[Lamp, ...]) -> LitScene:
+    """A block on a floor that is dark within a few texels of its foot, whatever the lamps; more or less in each
     channel."""
 
     def dark_at_the_foot(points: np.ndarray) -> np.ndarray:
@@ -368,19 +368,25 @@ def standing(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...])
         light = 1 - 0.6 * np.exp(-((np.hypot(*beside.T) / 0.05) ** 2))[:, None] * tint
         return encoded(linear_of(paint(points)) * light)
 
-    return make_scene("foot", [], dark_at_the_foot, casts=False)
+    return make_scene("foot", lamps, dark_at_the_foot, casts=bool(lamps))
 
 
 def linear_of(colours: np.ndarray) -> np.ndarray:
     return linear(np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8))
 
 
-@pytest.mark.parametrize(("paint", "tint"), [(grain, (1, 1, 1)), (plain, (1, 1, 1)), (grain, (0, 0.2, 1))])
-def test_the_rim_goes_with_the_object(paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...]) -> None:
-    scene, truth = standing(paint, tint), make_scene("bare", [], paint, casts=False).truth
+@pytest.mark.parametrize(
+    ("paint", "tint", "lamps"),
+    [(grain, (1, 1, 1), ()), (plain, (1, 1, 1), ()), (grain, (0, 0.2, 1), ()), (grain, (1, 1, 1), (SUN,))],
+)
+def test_the_rim_goes_with_the_object(
+    paint: Callable[[np.ndarray], np.ndarray], tint: tuple[float, ...], lamps: tuple[Lamp, ...]
+) -> None:
+    scene, truth = standing(paint, tint, lamps), make_scene("bare", [], paint, casts=False).truth
     seen = [View(c, render_bytes(scene.gaussians, c)) for c in scene.cameras(24, 480, 360)]
     result = remove_object(scene.gaussians, seen, scene.region, PRESETS["draft"])
     assert result.shadow["found"] and "dark rim" in result.shadow["reason"], result.shadow["reason"]
+    assert len(result.shadow["lights"]) == len(lamps)
     final = scene.gaussians.take(result.keep)
     final = final if result.added is None else final.extended(result.added)
     left, before = [], []
