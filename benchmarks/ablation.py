@@ -81,9 +81,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "charts take colours where a foot may be": (
         ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
-    "photos of rests vouch for them, and are not filled": (
-        ("gimp3d.steps.behind:hiding_rests", lambda witnesses, _: witnesses),
-    ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "what the object hides lies on planes": (
@@ -103,7 +100,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "one photo tells that the surface ends": (
         ("gimp3d.stages.charts:_through", lambda said: (said == Says.THROUGH).sum(0)),
     ),
-    "mixed pixels at the outline stay": (("gimp3d.stages.charts:_mixed", lambda _, hole, __: np.zeros_like(hole)),),
     # what stays round it
     "what stays learns nothing": (("gimp3d.steps.behind:SHOWN", math.inf),),
     "charts teach what stays nothing": (("gimp3d.steps.behind:WRONG", math.inf),),

@@ -73,21 +73,6 @@ def over_surfaces(scene: Gaussians, region: Region, laid: Sequence[Laid]) -> tup
     return low, sunk
 
 
-def hiding_rests(witnesses: Sequence[Witness], charts: Sequence[Chart]) -> list[Witness]:
-    """The witnesses with rests of the object as part of it: photos of them vouch for nothing, and are filled."""
-    if not any(chart.rests.any() for chart in charts):
-        return list(witnesses)
-
-    def of(witness: Witness) -> Witness:
-        hits = first_hits(charts, witness.camera, np.ones(witness.hidden.shape, bool))
-        rests = hits.of([chart.rests for chart in charts])
-        for number, chart in enumerate(charts):
-            rests &= (hits.chart != number) | ~hits.behind(witness.depth, chart.tolerance)
-        return replace(witness, hidden=witness.hidden | rests)
-
-    return parallel_map(of, witnesses)
-
-
 def clear_air(
     scene: Gaussians,
     region: Region,

@@ -26,7 +26,7 @@ from ..raster import label_weights
 from ..run import ViewState
 from ..stages.beside import Sight, shown_beside
 from ..stages.charts import Chart, Hits, Laid, Plane, draw_charts, extent, find_planes, lay_planes, pictured
-from ..stages.clearing import chart_targets, clear_air, hiding_rests, object_pixels, over_surfaces, pixels_of
+from ..stages.clearing import chart_targets, clear_air, object_pixels, over_surfaces, pixels_of
 from ..stages.ground import look_at
 from ..stages.lifting import Lifted, bare_photos, lift, recoloured
 from ..stages.masks import Masks, ViewMasks, spread_views
@@ -165,9 +165,8 @@ def clear_round(
     settings: RemovalSettings,
 ) -> Cleared:
     """Clear the air before charts, and say where they have to be filled."""
-    wary = hiding_rests(surfaces.witnesses(views, wary=True), charts)
+    wary, witnesses = surfaces.witnesses(views, wary=True), surfaces.witnesses(views)
     selection = clear_air(scene, region, surfaces.selection, wary, surfaces.beside, settings.clearing)
-    witnesses = hiding_rests(surfaces.witnesses(views), charts)
     targets = chart_targets(scene, selection, [v.masks for v in views], witnesses, charts, surfaces.marked)
     cleared = int((selection.removed & ~surfaces.selection.removed).sum())
     return Cleared(selection, targets, 1.0, f"{cleared} of haze go")
@@ -195,7 +194,7 @@ class Relit:
         return _words(self.shadow, self.contact, self.reflection)
 
     def facts(self) -> dict[str, Any]:
-        """For the summary, by name: see Shadow.facts and Reflection.facts; without a lamp's shadow its foot's is told."""
+        """For the summary, by name: see Shadow.facts and Reflection.facts; without a lamp's shadow its foot's."""
         shadow = self.contact if isinstance(self.shadow, str) else self.shadow
         told = {"shadow": shadow, "reflection": self.reflection}
         facts = {name: NOTHING[name] if isinstance(f, str) else f.facts() for name, f in told.items()}

@@ -596,36 +596,6 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     assert rests[12:18, 37:44].sum() == 1
 
 
-@pytest.mark.parametrize("grain", [1, 25])
-def test_mixed_pixels_beside_the_object_are_unlike_all_of_the_surface_near_by(grain: int) -> None:
-    """Yellow dashes that few photos show, at the edge of the hole; not a spot that the surface has elsewhere as well.
-
-    Where texels differ as much from each other, nothing tells them.
-    """
-    shape = (60, 80)
-    no, rng = np.zeros(shape, bool), np.random.default_rng(2)
-    hole, dashes, spot = no.copy(), no.copy(), no.copy()
-    hole[20:40, 30:50] = True
-    dashes[19, 32:48:3] = True
-    spot[40:42, 36:39] = spot[44:46, 30:33] = True
-    y, x = np.indices(shape)
-    waves = 12 * np.sin(x / 5) + 12 * np.cos(y / 4 + x / 9)
-    colours = np.array([190.0, 150, 120]) + waves[..., None] * [1, 0.9, 0.8]
-    colours[dashes], colours[hole], colours[spot] = [190, 150, 85], [200, 180, 20], [130, 100, 80]
-    image = np.clip(colours + rng.normal(0, grain, (*shape, 3)), 0, 255).astype(np.uint8)
-    beside = (cv2.dilate(hole.astype(np.uint8), np.ones((5, 5))) > 0) & ~hole
-
-    def mixed(photos: int, hiding: int) -> np.ndarray:
-        shown, hidden = (np.where(hole, 0, n).astype(np.uint16) for n in (photos, hiding))
-        described = stage._Shown(~no, image, shown, hidden, ~hole, ~hole, hole, np.zeros(no.shape))
-        return stage._mixed(described, hole, beside)
-
-    found = mixed(2, 5)
-    assert found[dashes].all() and not found[spot].any() if grain == 1 else found[dashes].mean() < 0.2
-    assert (found & ~dashes & ~spot).sum() <= 0.03 * beside.sum()
-    assert not mixed(5, 2).any()  # most photos show it
-
-
 def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:
     """Rough depths let photos see through the surface at a spot; a table's edge, in half of what is round the hole."""
     said = np.full((5, 60, 80), Says.SEEN, np.uint8)

@@ -21,7 +21,6 @@ from gimp3d.stages.clearing import (
     ClearingSettings,
     chart_targets,
     clear_air,
-    hiding_rests,
     object_pixels,
     over_surfaces,
 )
@@ -123,33 +122,6 @@ def test_photos_show_the_object_where_its_gaussians_draw(plain: Removal) -> None
 
 
 OFF = 0.45  # x of places on the floor beside the block
-
-
-def with_patch(mask: np.ndarray, chart: Chart, x: float) -> np.ndarray:
-    """The mask [H, W] with the texels round (x, 0) on the floor."""
-    uv, _ = chart.camera.project(np.array([[x, 0.0, 0.0]]))
-    col, row = uv[0].astype(int)
-    patched = mask.copy()
-    patched[row - 3 : row + 4, col - 3 : col + 4] = True
-    return patched
-
-
-def test_rests_are_part_of_the_object_in_photos_that_show_them(plain: Removal, charts: tuple[Chart, ...]) -> None:
-    (chart,) = charts
-    chart = replace(chart, rests=with_patch(np.zeros_like(chart.rests), chart, OFF))
-    hidden = 0
-    for old, new in zip(plain.witnesses, hiding_rests(plain.witnesses, (chart,))):
-        uv, z = old.camera.project(np.array([[OFF, 0.0, 0.0]]))
-        rows, cols = np.nonzero(new.hidden & ~old.hidden)
-        assert not (old.hidden & ~new.hidden).any()
-        assert len(rows) == 0 or np.hypot(rows - uv[0, 1], cols - uv[0, 0]).max() < 12  # the patch is 7 texels wide
-        if (old.depth[rows, cols] > 0.9 * z[0]).all() and len(rows):
-            hidden += 1
-    assert hidden > len(EYES) / 2
-    nearer = [replace(w, depth=np.where(w.depth > 0, w.depth / 2, 0)) for w in plain.witnesses]  # something before it
-    for old, new in zip(nearer, hiding_rests(nearer, (chart,))):
-        np.testing.assert_array_equal(new.hidden, old.hidden)
-    assert hiding_rests(nearer, (replace(chart, rests=np.zeros_like(chart.rests)),)) == nearer
 
 
 def test_what_photos_show_beside_the_object_is_no_haze() -> None:

@@ -46,7 +46,6 @@ UNLIKE = 3.0  # times what photos of the surface differ by, from which they show
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
 MIXED = 2  # texels round the object whose pixels show some of it
-UNUSUAL = 99  # percentile of what surface texels differ by from those near them; mixed ones differ by more
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
 SAMPLES = 128  # colours of each kind, squared, that the models of both are made of
@@ -280,8 +279,7 @@ def _told_by_colours(s: _Shown, object_colours: np.ndarray, inside: np.ndarray) 
     """Chart.rests, [H, W] bool: the object's mask is rough, and too small here and there. And what looks like the
     object, though photos do not agree that it lies there: it stands before the surface.
 
-    Texels right beside the object's mix with it. `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the
-    region.
+    `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the region.
     """
     far = cv2.distanceTransform((~s.hole).astype(np.uint8), cv2.DIST_L2, 5)
     doubtful = s.hole | (s.there & (s.photos + s.hiding > 0) & (inside | (far < SOFT)))
@@ -289,46 +287,7 @@ def _told_by_colours(s: _Shown, object_colours: np.ndarray, inside: np.ndarray) 
     object_ = shows_object(s.image, doubtful, s.hole, object_colours, s.image[around])
     rests = object_ & s.alike  # photos would not agree on something else that stands there
     spots = scipy.ndimage.binary_opening(rests, np.ones((2, 2)))  # OpenCV's would move them by half a texel
-    rests = (rests | dilated(spots, MIXED)) & (s.photos > 0)
-    hole = s.hole | rests
-    return rests | _mixed(s, hole, dilated(object_ & s.hole, MIXED) & ~hole & (s.photos > 0)), object_ & ~s.alike
-
-
-def _mixed(shown: _Shown, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """[H, W] bool: texels beside the object, hidden in most photos, unlike all of the surface near by.
-
-    More so than what of the surface is near them: a texel is compared with those that are not right beside it. And
-    more like what photos show in the hole.
-    """
-    beside = beside & (shown.hiding > shown.photos)
-    known = shown.alike & ~hole & ~beside
-    away = cv2.distanceTransform((~beside).astype(np.uint8), cv2.DIST_L2, 5)
-    around = known & (away <= SOFT)
-    if not around.any():
-        return around
-    foreign, usual = (_unlike_near(shown.image, texels, known) for texels in (beside, around))
-    unlike_object, usually = (_unlike_near(shown.image, texels, hole) for texels in (beside, around))
-    found = np.zeros_like(beside)
-    unusual = foreign > max(GRAIN, float(np.percentile(usual, UNUSUAL)))
-    found[beside] = unusual & (unlike_object < np.median(usually))
-    return found
-
-
-def _unlike_near(image: np.ndarray, texels: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """[N] RMS grey levels by which texels [H, W] bool differ from the most similar ones near by that are known.
-
-    0 where none is near. Texels within MIXED px are not compared with, as they may be mixed too.
-    """
-    rows, cols = np.nonzero(texels)
-    least = np.full(len(rows), np.inf, np.float32)
-    for down, right in np.ndindex(2 * SOFT + 1, 2 * SOFT + 1):
-        if max(abs(down - SOFT), abs(right - SOFT)) > MIXED:
-            y, x = rows + down - SOFT, cols + right - SOFT
-            there = (y >= 0) & (x >= 0) & (y < len(known)) & (x < known.shape[1])
-            there[there] = known[y[there], x[there]]
-            off = image[y[there], x[there]].astype(np.float32) - image[rows[there], cols[there]]
-            least[there] = np.minimum(least[there], (off**2).mean(-1))
-    return np.sqrt(np.where(np.isfinite(least), least, 0))
+    return (rests | dilated(spots, MIXED)) & (s.photos > 0), object_ & ~s.alike
 
 
 def usual_spread(spread: np.ndarray) -> float:
