@@ -271,11 +271,11 @@ def chart_of(
     image = np.rint(255 * encoded(np.clip(paint(x, y) * light, 0, 1))).astype(np.uint8)
     camera = Camera("chart:1", SIDE, SIDE, 500.0, 500.0, SIDE / 2, SIDE / 2, np.eye(4))
     plane = Plane.make(np.zeros(3), np.array([0.0, 0, 1]), ROUND)
-    no, photos = np.zeros_like(hole), np.where(hole, 0, 9).astype(np.uint16)
+    photos = np.where(hole, 0, 9).astype(np.uint16)
     depth, there = np.full(hole.shape, 5, np.float32), np.ones_like(hole)
     return Chart(
         plane, camera, depth, "plane", 1.0, 0.0, (), "",
-        there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole, photos, no, 0.0, 0.01,
+        there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole, photos, 0.0, 0.01,
     )  # fmt: skip
 
 

@@ -63,7 +63,6 @@ class Chart(Facing, Laid):
     """A surface seen straight on, its object left out; arrays [H, W] of its camera."""
 
     photos: np.ndarray  # uint16, how many show it
-    rests: np.ndarray  # bool, part of the hole: photos show the object there, though its mask does not cover it in all
     scatter: float  # relative z by which the views' drawn surfaces scatter about it
     tolerance: float  # the same, but never very small: within it a drawn surface is this one
 
@@ -193,7 +192,6 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Ch
         known=shown.known & ~hole & ~foreign,
         hole=hole,
         photos=shown.photos,
-        rests=rests,
         scatter=scatter,
         tolerance=tolerance,
     )
@@ -276,8 +274,8 @@ def _shown(
 
 
 def _told_by_colours(s: _Shown, object_colours: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Chart.rests, [H, W] bool: the object's mask is rough, and too small here and there. And what looks like the
-    object, though photos do not agree that it lies there: it stands before the surface.
+    """[H, W] bool each: rests, which are hole though the object's mask, which is rough, does not cover them in all
+    photos. And what looks like the object, though photos do not agree that it lies there: it stands before the surface.
 
     `object_colours` are [N, 3] uint8; texels [H, W] bool are `inside` the region.
     """
