@@ -125,6 +125,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "one Gaussian per pixel": (("seed.largest", 1),),
     "colours as seeded": (("seed.corrections", 0),),
     "no view dependence": (("seed.sh_degree", 0),),
+    "only photos tell view dependence": (("gimp3d.steps.references:views_between", lambda *_: ()),),
     "degree 1": (("seed.sh_degree", 1),),
     "degree 3": (("seed.sh_degree", 3),),
     "Gaussians that show nowhere stay": (("gimp3d.stages.seed:NEEDED", -1.0),),

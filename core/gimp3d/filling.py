@@ -34,6 +34,7 @@ class Filling:
 
     kept: Gaussians  # the scene without the object
     views: tuple[ViewState, ...]
+    between: tuple[ViewState, ...] = ()  # drawn ones, see references.views_between
     added: Gaussians | None = None
     done: tuple[Reference, ...] = ()  # completed references
     recoloured: np.ndarray = field(default_factory=lambda: np.zeros(0, int))  # rows of `kept` that are not as they came
@@ -47,6 +48,8 @@ def fill_hole(run: Run, filling: Filling, charts: tuple[Chart, ...], turns: Sequ
     if turns[0].chart is not None and turns[0].name and run.settings.depth_prior != "auto":
         run.warnings.append(f"--depth-prior {run.settings.depth_prior} is not used: the reference is a chart")
     filling = replace(filling, views=references.emptied(filling.kept, filling.views))
+    if charts and run.settings.seed.corrections:
+        filling = replace(filling, between=references.views_between(filling.kept, charts, filling.views))
     for number, turn in enumerate(turns):
         if number and open_pixels(filling.views) < run.settings.extra_gain * hole:
             break
@@ -109,24 +112,26 @@ def _complete_view(run: Run, filling: Filling, charts: tuple[Chart, ...], turn: 
 
 def _carry(run: Run, filling: Filling, completed: Completed, suffix: str) -> Filling:
     """A completed reference in every view, and the Gaussians that show it."""
-    settings, views, filled = run.settings, filling.views, filling.kept.extended(filling.added)
+    settings, filled, count = run.settings, filling.kept.extended(filling.added), len(filling.views)
+    views = *filling.views, *filling.between
     camera, of_seeds = completed.camera, settings.seed
     surface = completed.image, completed.depth, completed.target, filled.is_surfels, of_seeds, camera.split == CHART
     seeds = run(f"seed{suffix}", seed_gaussians, camera, *surface, words=counted)
     if len(seeds) == 0:
         raise IllPosed(f"reference {camera.id}: what is behind the object is infinitely far; nothing to build")
     sampled = settings.propagate.transfer == "sample"
-    field_ = run(f"mapping{suffix}", references.map_reference, completed, views, settings) if sampled else None
+    field_ = run(f"mapping{suffix}", references.map_reference, completed, filling.views, settings) if sampled else None
     inputs = completed, field_, views, filled.extended(seeds), settings, run.progress
     painting = run(f"propagate{suffix}", references.paint_views, *inputs)
     run.pictures += pictures.of_reference(completed, field_)
-    run.pictures += pictures.of_painting(painting, views)
-    given = filled, seeds, completed.camera, painting.views, settings.seed
+    run.pictures += pictures.of_painting(painting.views[:count], filling.views)
+    given = filled, seeds, completed.camera, painting.views[:count], settings.seed, painting.views[count:]
     new = run(f"settle{suffix}", settle_gaussians, *given, words=counted)
     added = new if filling.added is None else filling.added.extended(new)
     filled = filling.kept.extended(added)
     views = references.after_reference(views, painting.views, completed, filled, new, len(added))
-    return replace(filling, views=views, added=added, done=(*filling.done, completed))
+    filling = replace(filling, views=views[:count], between=views[count:])
+    return replace(filling, added=added, done=(*filling.done, completed))
 
 
 def ask_for_refinement(run: Run, filling: Filling) -> Filling:

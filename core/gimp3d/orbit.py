@@ -1,9 +1,10 @@
-"""Cameras round a region, for a scene that comes without any."""
+"""Cameras round a region: for a scene that comes without any, and in the gaps between those that it has."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ NEARBY = 4.0  # radii of the region round its centre within which its floor is s
 FLAT = 0.03  # of the radius: distance up to which a Gaussian lies on a plane
 SUNK = 0.25  # share of a region's height that its boxes may reach below its floor
 LEAST_FLOOR = 0.15  # share of the Gaussians round the region that a floor holds
+GAP = 20.0  # degrees to the next camera: harmonics of degree 2 turn their sign within 45
 SAMPLED, TRIES = 4000, 500  # Gaussians looked at, planes tried
 
 
@@ -71,6 +73,30 @@ def orbit_cameras(
         viewmat = look_at(centre + distance * away, centre, axis)
         cameras.append(Camera(f"orbit/{k:03d}", width, height, focal, focal, width / 2, height / 2, viewmat, "train"))
     return tuple(cameras)
+
+
+def cameras_between(cameras: Sequence[Camera], centre: np.ndarray) -> tuple[Camera, ...]:
+    """Cameras that look at the centre [3] from where GAP degrees round it no other stands, IDs between/000 …
+
+    Each stands half way between two of those given, the emptiest place first, and has the lens of the one next to it.
+    """
+    away = np.array([c.centre for c in cameras]) - centre
+    distance = np.linalg.norm(away, axis=1)
+    towards = away / np.maximum(distance, 1e-9)[:, None]
+    one, other = np.triu_indices(len(cameras), 1)
+    middle = towards[one] + towards[other]
+    length, far = np.linalg.norm(middle, axis=1), (distance[one] + distance[other]) / 2
+    proper = length > 1e-6
+    middle, far = middle[proper] / length[proper, None], far[proper]
+    found: list[Camera] = []
+    nearest = (middle @ towards.T).max(1) if len(middle) else np.zeros(0)
+    while len(nearest) and nearest.min() < math.cos(math.radians(GAP)):
+        k = int(nearest.argmin())
+        lens = cameras[int((towards @ middle[k]).argmax())]
+        viewmat = look_at(centre + far[k] * middle[k], centre, -lens.R[1])
+        found.append(replace(lens, id=f"between/{len(found):03d}", viewmat=viewmat, image=None))
+        nearest = np.maximum(nearest, middle @ middle[k])
+    return tuple(found)
 
 
 def _extent(region: Sequence[Box]) -> tuple[np.ndarray, np.ndarray, float]:

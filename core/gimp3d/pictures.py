@@ -17,7 +17,7 @@ from .run import Picture, ViewState
 from .stages.charts import Chart
 from .stages.depth import DepthCompletion
 from .stages.masks import Masks
-from .stages.propagate import Propagation, Rule
+from .stages.propagate import PaintedView, Rule
 from .stages.propagate.paper import MappingField
 from .stages.witness import spread
 from .steps.behind import Relit
@@ -96,10 +96,10 @@ def of_reference(completed: Completed, field: MappingField | None) -> list[Pictu
     return shown
 
 
-def of_painting(painting: Propagation, views: Sequence[ViewState]) -> list[Picture]:
+def of_painting(painted: Sequence[PaintedView], views: Sequence[ViewState]) -> list[Picture]:
     """Filled views: raw, blended, and by which rule."""
     before, shown = {v.id: v.painted for v in views}, []
-    for p in spread(painting.views, FEW):
+    for p in spread(painted, FEW):
         was = before[p.camera.id]
         maps = p.pasted(was), p.rule_map(), p.pasted(was, p.raw)
         shown.append(Picture("rules", f"Filled view {p.camera.id}", partial(by_rule, *maps)))

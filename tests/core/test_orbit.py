@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gimp3d.box import Box
+from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.gaussians import Gaussians, quats_to_matrices
-from gimp3d.orbit import measured_up, orbit_cameras
+from gimp3d.orbit import GAP, cameras_between, look_at, measured_up, orbit_cameras
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, -2, 0.5)])
@@ -51,6 +55,37 @@ def test_orbits_are_the_same_every_time_and_spread_over_three_rings() -> None:
     assert {round(e) for e in np.degrees(np.arcsin(away[:, 2]))} == {15, 35, 60}
     angles = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])) % 360)
     np.testing.assert_allclose(np.diff(angles), 30, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 12])
+def test_cameras_between_others_leave_no_gap(count: int) -> None:
+    """But beyond the outermost ones: there nothing is drawn that a photo told."""
+    box = Box.make([1, 2, 3], [1, 1, 1])
+    given = orbit_cameras((box,), 24)[:: 24 // count][:count]
+    found = cameras_between(given, box.center)
+    assert (len(found) == 0) == (count == 1) and len({c.id for c in found}) == len(found)
+
+    def towards(cameras: Sequence[Camera]) -> np.ndarray:
+        away = np.array([c.centre for c in cameras]).reshape(-1, 3) - box.center
+        return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+    middle = (towards(given)[:, None] + towards(given)).reshape(-1, 3)
+    middle = middle[np.linalg.norm(middle, axis=1) > 1e-6]
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    both = np.concatenate([towards(given), towards(found)])
+    assert ((middle @ both.T).max(1, initial=-1) > np.cos(np.radians(GAP + 1e-6))).all()
+    apart = towards(found) @ both.T
+    apart[:, count:][np.diag_indices(len(found))] = -1
+    assert (apart < np.cos(np.radians(GAP - 1e-6))).all()  # and none where another one stands
+    for camera in found:
+        assert camera.project(box.center)[0] == pytest.approx([camera.width / 2, camera.height / 2])
+        assert camera.R[1, 2] < 0  # upright
+
+
+def test_cameras_that_face_each_other_have_no_middle() -> None:
+    lens = orbit_cameras((Box.make([0, 0, 0], [1, 1, 1]),), 1)[0]
+    two = [replace(lens, viewmat=look_at(np.array([x, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1.0]))) for x in (3, -3)]
+    assert cameras_between(two, np.zeros(3)) == ()
 
 
 def splats(points: np.ndarray) -> Gaussians:

@@ -7,13 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import REGION, cameras, scene
+from scenes import REGION, cameras, scene, truth
 
+from gimp3d.camera import Camera
 from gimp3d.errors import BadInput
 from gimp3d.frame import Frame
-from gimp3d.gaussians import Gaussians
+from gimp3d.gaussians import Gaussians, pad_sh
+from gimp3d.orbit import look_at
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.progress import forecast_removal
+from gimp3d.raster import footprint
+from gimp3d.steps import references
 
 IN_ORDER = [
     "masks",
@@ -71,6 +75,38 @@ def test_light_is_told_where_photos_show_the_reference_and_nowhere_in_a_hole(nam
         assert (completed.source == chart.shown).all() and (completed.target & ~chart.hole & completed.source).any()
     hole = hits.of([chart.hole]) if named else chart.hole
     assert (hole & completed.target).sum() > 100 and not (hole & completed.source & completed.target).any()
+
+
+def test_what_is_filled_shines_as_its_surroundings_do_where_no_photo_looks_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A floor that is brighter from between two groups of photos than from these, which show all of it alike."""
+
+    def shining(splats: Gaussians) -> Gaussians:
+        sh = pad_sh(splats.sh, 9)
+        sh[:, 4] += 0.45 * (np.abs(splats.means[:, 2:]) < 0.01)  # of x·y
+        return replace(splats, sh=sh)
+
+    def look(azimuth: float, elevation: float) -> Camera:
+        a, e = np.radians([azimuth, elevation])
+        eye = 2.2 * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+        viewmat = look_at(eye, REGION[0].center, np.array([0.0, 0.0, 1.0]))
+        return replace(cameras(1)[0], id=f"{azimuth}/{elevation}", viewmat=viewmat)
+
+    with_block, without = shining(scene()), shining(truth())
+    groups = [look(middle + side, e) for middle in (0, 90) for side in (-8, 8) for e in (25, 40, 55)]
+    photos, from_between = [View(c, render_bytes(with_block, c)) for c in groups], look(45, 40)
+
+    def off() -> float:
+        result = remove_object(with_block, photos, REGION, PRESETS["draft"])
+        filled = with_block.take(result.keep).extended(result.added)
+        shows = footprint(filled, from_between, np.arange(len(filled)) >= result.keep.sum()) > 0.9
+        drawn, true = (render_bytes(g, from_between)[shows].astype(float) for g in (filled, without))
+        return abs(float((drawn - true).mean()))
+
+    following = off()
+    monkeypatch.setattr(references, "views_between", lambda *_: ())
+    assert following < 0.7 * off()
 
 
 def test_an_observer_can_stand_in_for_a_stage() -> None:

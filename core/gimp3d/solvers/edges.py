@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from ..compute.threads import parallel_map
-from ..geometry import bounds
+from ..geometry import bounds, dilated
 from .regularity import pattern_search, turn_of
 
 SIDE = 192  # px: pictures are shrunk to this to look for edges
@@ -29,13 +29,12 @@ TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
 HALF_TELLS = 8.0  # where it is told on one side only: among all lines noise alone comes to 7
 STEEP = 4.0  # grey levels that it must be
 CLUMPED = 4.0  # by which textures' noise exceeds that of independent pixels, squared
-LIKE = 0.7  # cosine between the steps on both sides
 ROWS = np.array([-6, -5, -4, -2, -1, 1, 2, 4, 5, 6])  # px across an edge
 FAR_ABOVE, ABOVE, BELOW, FAR_BELOW = slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 10)
 SHARP = 0.5  # share of the step between what is further from it that it must be: else it is a slope
 BLOCK = 8  # known px along it: its length is told by so many at a time …
 CLOSEST = 3  # … and it must reach through the blocks next to the hole
-STEADY = 0.5  # share of the usual step that it is in each
+STEADY = 0.5  # share of the usual step that it is in each, and by which two edges' may differ that are one
 CLOSE = 4  # px beyond the hole, with the colours on both sides of an edge, that tell that it runs on to there
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
@@ -128,8 +127,10 @@ class _Half:
 
 
 def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
-    """Pairs as far as the corner in the hole at which they meet, nearest first; others as far as what is not known."""
-    meetings = []
+    """Pairs as far as the corner at which they meet in the hole or next to it, nearest first; others as far as what is
+    not known.
+    """
+    meetings, place = [], dilated(hole, CLOSE)
     for (k, one), (j, other) in itertools.combinations(enumerate(halves), 2):
         a, b = one.edge, other.edge
         turn = a.along[0] * b.along[1] - a.along[1] * b.along[0]
@@ -141,7 +142,7 @@ def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
         t, u = ((apart[0] * d[1] - apart[1] * d[0]) / turn for d in (b.along, a.along))
         x, y = np.rint(a.origin + t * a.along).astype(int)
         ways = (t - one.enters) * one.inwards, (u - other.enters) * other.inwards
-        if min(ways) >= 0 and 0 <= y < hole.shape[0] and 0 <= x < hole.shape[1] and hole[y, x]:
+        if min(ways) >= 0 and 0 <= y < hole.shape[0] and 0 <= x < hole.shape[1] and place[y, x]:
             meetings.append((sum(ways), {k: one.until(t), j: other.until(u)}))
     found: dict[int, Edge] = {}
     for _, pair in sorted(meetings, key=lambda m: m[0]):
@@ -200,7 +201,7 @@ def _told(sums: np.ndarray, least: float) -> np.ndarray:
         steps = means[:, 1] - means[:, 0]
         size = np.linalg.norm(steps, axis=-1)
         told = np.where(size >= STEEP, size / np.sqrt(noise), 0).min(0)
-        alike = (steps[0] * steps[-1]).sum(-1) > LIKE * (size[0] * size[-1])
+        alike = np.linalg.norm(steps[0] - steps[-1], axis=-1) <= STEADY * size.max(0)
     return np.where((pixels >= least).all((0, 1, 3)) & alike & (told >= TELLS), told, 0.0)
 
 

@@ -197,6 +197,7 @@ def settle_gaussians(
     reference: Camera,
     painted: Sequence[PaintedView],
     settings: SeedSettings = SeedSettings(),
+    between: Sequence[PaintedView] = (),  # drawn views, that are painted as well: see steps.references.views_between
 ) -> Gaussians:
     """The seeds that show somewhere, of the scene's SH degree, in colours by which it, drawn, shows the painted views.
 
@@ -216,7 +217,7 @@ def settle_gaussians(
     if not settings.corrections:
         return new
     others = [p for p in painted if p.rules.any() and p.camera.id != reference.id]
-    looks = others[:: math.ceil(len(others) / LOOKS) or 1]
+    looks = [*others[:: math.ceil(len(others) / LOOKS) or 1], *(p for p in between if p.rules.any())]
     joined = scene.extended(new)
 
     def peak(camera: Camera) -> np.ndarray:

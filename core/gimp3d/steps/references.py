@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 import scipy.ndimage
 
+from ..camera import Camera
 from ..compute.threads import parallel_map
 from ..errors import BadInput
 from ..gaussians import Gaussians
 from ..geometry import SOLID, colours_at, dilated, disparity_of, sees, window_mask
+from ..orbit import cameras_between
 from ..presets import RemovalSettings
 from ..priors.calls import Call
 from ..priors.inpaint import PROVIDERS, inpaint_reference
@@ -27,8 +29,9 @@ from ..priors.pasting import Appearance, paste_picture
 from ..progress import Progress
 from ..raster import Window, drawing, render_bytes, surface_depth, touched_window
 from ..run import ViewState
-from ..stages.charts import CHART, Chart, chart_number, pictured
+from ..stages.charts import CHART, Chart, chart_number, first_hits, pictured
 from ..stages.depth import DepthCompletion, PriorFit, complete_depth
+from ..stages.exposure import Exposure
 from ..stages.masks import ViewMasks
 from ..stages.propagate import PaintedView, Propagation, Reference, Rule, ViewToPaint, near_hole, propagate, round_hole
 from ..stages.propagate.paper import MappingField, mapping_field, source_visibility
@@ -186,6 +189,31 @@ def emptied(kept: Gaussians, views: Sequence[ViewState]) -> tuple[ViewState, ...
         return replace(view, painted=np.where(silhouette[..., None], drawn, view.bare))
 
     return tuple(parallel_map(empty, views))
+
+
+def views_between(kept: Gaussians, charts: Sequence[Chart], views: Sequence[ViewState]) -> tuple[ViewState, ...]:
+    """Drawn views of the emptied scene where photos leave gaps round what is to be filled on charts.
+
+    Photos tell what is there. But scans extrapolate their splats' view dependence where no photo looks from, and
+    what is filled has to follow what is drawn round it there, or it shows as a patch.
+    """
+    needed = [texels_to_fill(chart, number, views)[0] for number, chart in enumerate(charts)]
+    if not any(n.any() for n in needed):
+        return ()
+    centre = np.concatenate([c.points()[n] for c, n in zip(charts, needed)]).mean(0)
+    tolerance = max(c.tolerance for c in charts)
+
+    def look(camera: Camera) -> ViewState:
+        image, (depth, alpha) = render_bytes(kept, camera), surface_depth(kept, camera)
+        hits = first_hits(charts, camera, np.ones(depth.shape, bool))
+        target = hits.of(needed) & ~hits.behind(depth, tolerance)
+        open_, no = dilated(target, MARGIN) | (alpha < SOLID), np.zeros_like(target)
+        before = np.where(target, 0, depth).astype(np.float32)
+        masks = ViewMasks(camera, target, open_, no, target, before, alpha, depth, alpha, target.astype(np.float32))
+        return replace(ViewState.first(masks, image, Exposure(np.ones(3))), hits=hits)
+
+    looks = parallel_map(look, cameras_between([v.camera for v in views], centre))
+    return tuple(v for v in looks if v.masks.target.any())
 
 
 def map_reference(completed: Completed, views: Sequence[ViewState], settings: RemovalSettings) -> MappingField:

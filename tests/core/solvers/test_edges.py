@@ -93,6 +93,22 @@ def test_two_edges_that_are_told_on_one_side_each_meet_in_a_corner(turned: int, 
     assert run(checks, corner, [turned + t for t in (0, 90, 180, 270)])
 
 
+def test_a_border_that_another_one_continues_by_chance_has_its_corner() -> None:
+    """A mat's beside a board's grain: both get darker there, but not from the same to the same."""
+    mat, board = (X < 3) & (Y < 3), np.where(Y < 3, 110.0, 90.0)
+    assert run(found(textured(np.where(mat, 180.0, board), 5)), (3, 3), [180, 270])
+
+
+@pytest.mark.parametrize("turned", [0, 30, 75])
+def test_they_meet_right_beyond_the_hole_too(turned: int) -> None:
+    a = math.radians(turned)
+    down, right = math.cos(a) * Y - math.sin(a) * X, math.cos(a) * X + math.sin(a) * Y
+    assert not HOLE[(down > 22.5) & (right > 22.5)].any()
+    edges = found(textured(np.where((down < 22.5) & (right < 22.5), 150.0, 100.0), 6))
+    corner = 22.5 * (math.cos(a) - math.sin(a)), 22.5 * (math.sin(a) + math.cos(a))
+    assert run(edges, corner, [turned + 180, turned + 270])
+
+
 def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
     picture, known = textured(np.where(side_of(0, 3) > 0, 150.0, 100.0), 8), ~HOLE & (X < 25)
     edges = find_edges(np.where(known[..., None], picture, np.uint8(0)), HOLE, known, known)
