@@ -20,6 +20,7 @@ FLAT = 0.03  # of the radius: distance up to which a Gaussian lies on a plane
 SUNK = 0.25  # share of a region's height that its boxes may reach below its floor
 LEAST_FLOOR = 0.15  # share of the Gaussians round the region that a floor holds
 GAP = 20.0  # degrees to the next camera: harmonics of degree 2 turn their sign within 45
+PAIRED = 64  # cameras
 SAMPLED, TRIES = 4000, 500  # Gaussians looked at, planes tried
 
 
@@ -78,21 +79,23 @@ def orbit_cameras(
 def cameras_between(cameras: Sequence[Camera], centre: np.ndarray) -> tuple[Camera, ...]:
     """Cameras that look at the centre [3] from where GAP degrees round it no other stands, IDs between/000 …
 
-    Each stands half way between two of those given, the emptiest place first, and has the lens of the one next to it.
+    Each stands half way between two of those given that are less than 120° apart, the emptiest place first, and has
+    the lens of the one next to it. Of many cameras only some, evenly, are paired.
     """
     away = np.array([c.centre for c in cameras]) - centre
     distance = np.linalg.norm(away, axis=1)
     towards = away / np.maximum(distance, 1e-9)[:, None]
-    one, other = np.triu_indices(len(cameras), 1)
+    paired = np.arange(len(cameras))[:: math.ceil(len(cameras) / PAIRED)]
+    one, other = paired[np.array(np.triu_indices(len(paired), 1))]
     middle = towards[one] + towards[other]
     length, far = np.linalg.norm(middle, axis=1), (distance[one] + distance[other]) / 2
-    proper = length > 1e-6
+    proper = length > 1
     middle, far = middle[proper] / length[proper, None], far[proper]
     found: list[Camera] = []
     nearest = (middle @ towards.T).max(1) if len(middle) else np.zeros(0)
     while len(nearest) and nearest.min() < math.cos(math.radians(GAP)):
-        k = int(nearest.argmin())
-        lens = cameras[int((towards @ middle[k]).argmax())]
+        k = int(nearest.round(9).argmin())  # the first of equal ones, with every BLAS
+        lens = cameras[int((towards @ middle[k]).round(9).argmax())]
         viewmat = look_at(centre + far[k] * middle[k], centre, -lens.R[1])
         found.append(replace(lens, id=f"between/{len(found):03d}", viewmat=viewmat, image=None))
         nearest = np.maximum(nearest, middle @ middle[k])

@@ -63,14 +63,14 @@ def test_cameras_between_others_leave_no_gap(count: int) -> None:
     box = Box.make([1, 2, 3], [1, 1, 1])
     given = orbit_cameras((box,), 24)[:: 24 // count][:count]
     found = cameras_between(given, box.center)
-    assert (len(found) == 0) == (count == 1) and len({c.id for c in found}) == len(found)
+    assert (len(found) == 0) == (count < 3) and len({c.id for c in found}) == len(found)
 
     def towards(cameras: Sequence[Camera]) -> np.ndarray:
         away = np.array([c.centre for c in cameras]).reshape(-1, 3) - box.center
         return away / np.linalg.norm(away, axis=1, keepdims=True)
 
     middle = (towards(given)[:, None] + towards(given)).reshape(-1, 3)
-    middle = middle[np.linalg.norm(middle, axis=1) > 1e-6]
+    middle = middle[np.linalg.norm(middle, axis=1) > 1]  # of those 120° apart
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     both = np.concatenate([towards(given), towards(found)])
     assert ((middle @ both.T).max(1, initial=-1) > np.cos(np.radians(GAP + 1e-6))).all()
@@ -79,13 +79,25 @@ def test_cameras_between_others_leave_no_gap(count: int) -> None:
     assert (apart < np.cos(np.radians(GAP - 1e-6))).all()  # and none where another one stands
     for camera in found:
         assert camera.project(box.center)[0] == pytest.approx([camera.width / 2, camera.height / 2])
-        assert camera.R[1, 2] < 0  # upright
+        assert camera.R[1, 2] < 1e-9  # not upside down
 
 
-def test_cameras_that_face_each_other_have_no_middle() -> None:
-    lens = orbit_cameras((Box.make([0, 0, 0], [1, 1, 1]),), 1)[0]
-    two = [replace(lens, viewmat=look_at(np.array([x, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1.0]))) for x in (3, -3)]
-    assert cameras_between(two, np.zeros(3)) == ()
+def test_hundreds_of_cameras_in_two_groups_have_some_between_them() -> None:
+    box = Box.make([0, 0, 0], [1, 1, 1])
+    around = orbit_cameras((box,), 3600)
+    groups = [*around[:400], *around[900:1300]]  # 40° wide, 50° apart
+    assert 2 <= len(cameras_between(groups, box.center)) <= 12
+
+
+@pytest.mark.parametrize("apart", [119, 121, 180])
+def test_cameras_far_apart_have_none_between_them(apart: float) -> None:
+    """Half way between two that face each other a camera would look straight down, and could not be upright."""
+    lens, a = orbit_cameras((Box.make([0, 0, 0], [1, 1, 1]),), 1)[0], np.radians(apart)
+    eyes = 3.0 * np.array([[1, 0, 0], [np.cos(a), 0, np.sin(a)]])
+    up = np.cross(eyes, [0.0, 1, 0])
+    two = [replace(lens, viewmat=look_at(e, np.zeros(3), u)) for e, u in zip(eyes, up)]
+    found = cameras_between(two, np.zeros(3))
+    assert len(found) == (apart < 120) and all(np.isfinite(c.viewmat).all() for c in found)
 
 
 def splats(points: np.ndarray) -> Gaussians:
