@@ -20,7 +20,7 @@ FLAT = 0.03  # of the radius: distance up to which a Gaussian lies on a plane
 SUNK = 0.25  # share of a region's height that its boxes may reach below its floor
 LEAST_FLOOR = 0.15  # share of the Gaussians round the region that a floor holds
 GAP = 20.0  # degrees to the next camera: harmonics of degree 2 turn their sign within 45
-PAIRED = 64  # cameras
+PAIRED = 64  # cameras; memory goes with its square
 SAMPLED, TRIES = 4000, 500  # Gaussians looked at, planes tried
 
 
@@ -92,13 +92,14 @@ def cameras_between(cameras: Sequence[Camera], centre: np.ndarray) -> tuple[Came
     proper = length > 1
     middle, far = middle[proper] / length[proper, None], far[proper]
     found: list[Camera] = []
-    nearest = (middle @ towards.T).max(1) if len(middle) else np.zeros(0)
+    # rounded, so that the first of equal ones is taken with every BLAS
+    nearest = (middle @ towards.T).max(1).round(9)
     while len(nearest) and nearest.min() < math.cos(math.radians(GAP)):
-        k = int(nearest.round(9).argmin())  # the first of equal ones, with every BLAS
+        k = int(nearest.argmin())
         lens = cameras[int((towards @ middle[k]).round(9).argmax())]
         viewmat = look_at(centre + far[k] * middle[k], centre, -lens.R[1])
         found.append(replace(lens, id=f"between/{len(found):03d}", viewmat=viewmat, image=None))
-        nearest = np.maximum(nearest, middle @ middle[k])
+        nearest = np.maximum(nearest, (middle @ middle[k]).round(9))
     return tuple(found)
 
 
