@@ -134,6 +134,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours alone are refined": (("gimp3d.stages.refine:RATES", ALL_ZERO),),
     # the fill
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
+    "halves of edges do not meet on a line": (("gimp3d.solvers.edges:_straight", lambda *_: None),),
     "no edge turns a corner, nor ends unseen": (("gimp3d.solvers.edges:_joined", lambda *_: []),),
     "an edge is told as far as others, or not": (("gimp3d.solvers.edges:SOON", REACH),),
     "what photos disagree on ends edges": (

@@ -1,6 +1,6 @@
 """Straight edges that a hole cuts: each is told on both sides of it, and runs straight on in between.
 
-One that is told on one side only runs on until it meets another of the same corner, or what is not known.
+One that is told on one side only runs on until it meets another, of the same line or corner, or what is not known.
 
 What is large is continued before what is small (structure propagation: Sun, Yuan, Jia and Shum 2005).
 """
@@ -121,37 +121,77 @@ class _Half:
     leaves: float  # and out of it, or ends beyond
     goes_on: bool  # what is known beyond the hole does not tell that it ends
 
+    @property
+    def entry(self) -> np.ndarray:
+        """[2] px, where it runs into the hole."""
+        return self.edge.origin + self.enters * self.edge.along
+
+    def faces(self, other: _Half) -> bool:
+        """Whether the other one runs into the hole where this one leaves it, among the pixels by which it is told."""
+        x, y = other.entry - self.edge.origin
+        aside = abs(x * self.edge.along[1] - y * self.edge.along[0])
+        return aside <= ROWS[BELOW].max() and (other.entry - self.entry) @ self.edge.along * self.inwards > 0
+
     def until(self, t: float) -> Edge:
         first, last = self.edge.ends
         return replace(self.edge, ends=(first, t) if self.inwards > 0 else (t, last))
 
 
 def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
-    """Pairs as far as the corner at which they meet in the hole or next to it, nearest first; others as far as what is
-    not known.
+    """Pairs as far as where they meet: at corners in the hole or next to it, else in the middle of straight lines,
+    nearest first; others as far as what is not known.
     """
     meetings, place = [], dilated(hole, CLOSE)
     for (k, one), (j, other) in itertools.combinations(enumerate(halves), 2):
-        a, b = one.edge, other.edge
-        turn = a.along[0] * b.along[1] - a.along[1] * b.along[0]
-        # round a corner what lies to the right of the way in lies to the right of the way out
-        steps = one.inwards * a.step, -other.inwards * b.step
-        if abs(turn) < TURN or np.linalg.norm(steps[0] - steps[1]) > STEADY * max(np.linalg.norm(s) for s in steps):
-            continue
-        apart = b.origin - a.origin
-        t, u = ((apart[0] * d[1] - apart[1] * d[0]) / turn for d in (b.along, a.along))
-        x, y = np.rint(a.origin + t * a.along).astype(int)
-        ways = (t - one.enters) * one.inwards, (u - other.enters) * other.inwards
-        if min(ways) >= 0 and 0 <= y < hole.shape[0] and 0 <= x < hole.shape[1] and place[y, x]:
-            meetings.append((sum(ways), {k: one.until(t), j: other.until(u)}))
+        for straight, meeting in enumerate((_corner(one, other, place), _straight(one, other))):
+            if meeting is not None:
+                way, t, u = meeting
+                meetings.append((straight, way, {k: one.until(t), j: other.until(u)}))
     found: dict[int, Edge] = {}
-    for _, pair in sorted(meetings, key=lambda m: m[0]):
+    for *_, pair in sorted(meetings, key=lambda m: m[:2]):
         if not found.keys() & pair.keys():
             found |= pair
     for k, half in enumerate(halves):
         if k not in found and half.goes_on and abs(half.leaves - half.enters) >= LEAST:
             found[k] = half.until(half.leaves)
     return list(found.values())
+
+
+def _corner(one: _Half, other: _Half, place: np.ndarray) -> tuple[float, float, float] | None:
+    """The way round a corner that lies in `place`, [H, W] bool, and how far on each edge it is."""
+    a, b = one.edge, other.edge
+    turn = a.along[0] * b.along[1] - a.along[1] * b.along[0]
+    if abs(turn) < TURN or not _alike(*_ways(one, other)):
+        return None
+    apart = b.origin - a.origin
+    t, u = ((apart[0] * d[1] - apart[1] * d[0]) / turn for d in (b.along, a.along))
+    x, y = np.rint(a.origin + t * a.along).astype(int)
+    ways = (t - one.enters) * one.inwards, (u - other.enters) * other.inwards
+    meets = min(ways) >= 0 and 0 <= y < place.shape[0] and 0 <= x < place.shape[1] and place[y, x]
+    return (sum(ways), t, u) if meets else None
+
+
+def _straight(one: _Half, other: _Half) -> tuple[float, float, float] | None:
+    """The way between two that run towards each other on one line, and how far on each edge its middle is.
+
+    Grain and light change beside a border, its line does not. Where colours only change sides another edge crosses it.
+    """
+    there, back = _ways(one, other)
+    if not (one.faces(other) and other.faces(one)) or _alike(there, -back):
+        return None
+    middle = (one.entry + other.entry) / 2
+    t, u = (float((middle - half.edge.origin) @ half.edge.along) for half in (one, other))
+    return float(np.linalg.norm(one.entry - other.entry)), t, u
+
+
+def _ways(one: _Half, other: _Half) -> tuple[np.ndarray, np.ndarray]:
+    """[3] each: steps from left to right of the way into the hole along one, and out of it along the other."""
+    return one.inwards * one.edge.step, -other.inwards * other.edge.step
+
+
+def _alike(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two edges' steps [3] are one."""
+    return bool(np.linalg.norm(a - b) <= STEADY * max(np.linalg.norm(a), np.linalg.norm(b)))
 
 
 def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: float, scale: float) -> np.ndarray:

@@ -99,6 +99,23 @@ def test_a_border_that_another_one_continues_by_chance_has_its_corner() -> None:
     assert run(found(textured(np.where(mat, 180.0, board), 5)), (3, 3), [180, 270])
 
 
+@pytest.mark.parametrize("angle", [0, 40, 90, 140])
+def test_a_border_runs_on_where_what_is_beside_it_changes(angle: float) -> None:
+    """A mat's beside a board that gets brighter: both halves are on one line, though no step is like the other."""
+    on = math.cos(math.radians(angle)) * X + math.sin(math.radians(angle)) * Y
+    board = 195 + 45 * np.clip(on / 30, -1, 1)
+    edges = found(textured(np.where(side_of(angle, 4) > 0, 120.0, board), 5))
+    ends = np.array([e.origin + t * e.along - MIDDLE for e in edges for t in e.ends])
+    off = math.cos(math.radians(angle)) * ends[:, 1] - math.sin(math.radians(angle)) * ends[:, 0] - 4
+    assert len(edges) == 2 and np.abs(off).max() < 1.5 and sorted(np.hypot(*ends.T) < 8) == [False, False, True, True]
+
+
+def test_borders_on_two_lines_are_not_one() -> None:
+    """Close to each other they may lie, as books of a row do."""
+    board = 195 + 45 * np.clip(X / 30, -1, 1)
+    assert not found(textured(np.where(np.where(X < 0, 0, 5) < Y, 120.0, board), 5))
+
+
 @pytest.mark.parametrize("turned", [0, 30, 75])
 def test_they_meet_right_beyond_the_hole_too(turned: int) -> None:
     a = math.radians(turned)
