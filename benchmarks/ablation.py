@@ -78,6 +78,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),
     "photos are cut at their own size": (("gimp3d.stages.beside:ROUNDS", (1, 1)),),
     "a twentieth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.05),),
+    "a quarter of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.25),),
     "charts take colours where a foot may be": (
         ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
