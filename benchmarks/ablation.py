@@ -24,6 +24,7 @@ from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.edges import REACH
 from gimp3d.solvers.exemplar import EDGE
+from gimp3d.stages.beside import Shown
 from gimp3d.stages.charts import grid
 from gimp3d.stages.witness import Says
 
@@ -46,6 +47,10 @@ class Around:
 
 def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
     return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
+
+
+def _none_both(shown: Shown) -> Shown:
+    return shown._replace(both=np.zeros_like(shown.both))
 
 
 ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
@@ -72,7 +77,13 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),
     "a tenth of it is": (("clearing.observed", 0.1),),
     "colours do not tell the object from what is beside it": (
-        ("gimp3d.steps.behind:shown_beside", lambda scene, *_: np.zeros((2, len(scene)), bool)),
+        (
+            "gimp3d.steps.behind:shown_beside",
+            lambda scene, *_: Shown(*np.zeros((3, len(scene)), bool), np.zeros(len(scene)), []),
+        ),
+    ),
+    "Gaussians that are both are taken or left whole": (
+        ("gimp3d.steps.behind:shown_beside", Around(lambda shown: lambda *p: _none_both(shown(*p)))),
     ),
     "what was left is not asked": (("gimp3d.steps.behind:LEFT", ()),),
     "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),

@@ -43,6 +43,7 @@ class Behind:
     views: tuple[ViewState, ...]
     charts: tuple[Chart, ...]
     lit: Relit
+    parts: int = 0  # the scenes' last rows, that came by splitting and go
 
     def recoloured(self, kept: Gaussians, rows: np.ndarray) -> Behind:
         """With what stays, of which the rows [M] have other colours now."""
@@ -73,14 +74,14 @@ def look_behind(
 
     def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Surfaces, Charted]:
         """What the object does to the light undone, and the surfaces and their charts as they are then."""
-        light = run(f"lift{suffix}", undo_light, scene, surfaces, views, found) if found.effects else None
+        light = run(f"lift{suffix}", undo_light, surfaces.scene, surfaces, views, found) if found.effects else None
         lit = replace(found, lifted=light)
         bounded = surfaces if light is None else surfaces.with_marked(light.dark)
         return lit, bounded, run(f"charts{suffix}", chart_surfaces, region, bounded, lit.views(views))
 
     found = NOT_LIT
     if settings.shadow != "off":
-        found = run("light", find_light, scene, region, surfaces, views, shadow_masks, settings)
+        found = run("light", find_light, surfaces.scene, region, surfaces, views, shadow_masks, settings)
         if isinstance(found.shadow, str) and settings.shadow == "mask":
             run.warnings.append(found.shadow)
     lit, bounded, charted = in_light(found)
@@ -94,15 +95,16 @@ def look_behind(
         surfaces = run("surfaces 2", find_surfaces, *inputs, False)
         masks = replace(masks, selection=surfaces.selection)
         lit, bounded, charted = in_light(found, " 3")
-    scene, views = lit.scene(scene), lit.views(views)
+    scene, views = lit.scene(surfaces.scene), lit.views(views)
     if charted.charts:
         cleared = run("clear", clear_round, scene, region, bounded, charted.charts, views, settings)
         masks = replace(masks, selection=cleared.selection, views=tuple(m for m, _ in cleared.targets))
         views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, cleared.targets))
-    behind = Behind(scene, scene, lit.rows, masks, views, charted.charts, lit)
+    changed = np.union1d(lit.rows, surfaces.split)
+    behind = Behind(scene, scene, changed, masks, views, charted.charts, lit, len(surfaces.split))
     if not settings.refine.steps:
         return behind
     given = scene, region, masks.removed, views, charted.charts, settings, run.progress
     learned = run("relearn", relearn, *given)
     scene = scene.with_rows(learned.rows, learned.gaussians)
-    return replace(behind, scene=scene, changed=np.union1d(lit.rows, learned.rows))
+    return replace(behind, scene=scene, changed=np.union1d(changed, learned.rows))

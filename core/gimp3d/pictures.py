@@ -52,6 +52,7 @@ def of_growth(scene: Gaussians, masks: Masks, views: Sequence[ViewState]) -> lis
     if masks.growth is None or not masks.growth.rows.any():
         return []
     rows, title = masks.growth.rows, "Taken along" if masks.growth.taken else "Cut off by the box"
+    scene = scene.take(np.arange(len(rows)))  # without what was split off
     cut = scene.take(rows)
 
     def shown(v: ViewState) -> np.ndarray:

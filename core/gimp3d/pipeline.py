@@ -23,6 +23,7 @@ from .progress import Progress, silent
 from .raster import render_bytes
 from .run import Observer, Picture, RemovalResult, Run, StageReport, Store, View, ViewState, open_pixels
 from .stages.masks import find_masks
+from .stages.selection import Selection
 from .stages.verdict import Verdict, judge
 from .steps.behind import (
     Relit,
@@ -206,8 +207,9 @@ def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: An
     changed = np.intersect1d(behind.changed, np.flatnonzero(keep))  # some were taken away since
     lifted = int(keep[lit.rows].sum())
     keep[changed] = False
+    given = len(keep) - behind.parts
     return RemovalResult(
-        keep=keep,
+        keep=keep[:given],
         added=behind.scene.take(changed).extended(added) if len(changed) else added,
         stages=tuple(run.stages),
         hole_pixels=masks.hole_pixels,
@@ -215,7 +217,7 @@ def _result(run: Run, behind: Behind, added: Gaussians | None = None, **more: An
         pictures=tuple(run.pictures),
         references=tuple(run.references),
         warnings=tuple(run.warnings),
-        selection=masks.selection.counts,
+        selection=Selection(masks.selection.fates[:given]).counts,
         proposed=masks.proposed,
         lifted=lifted,
         changed=len(changed),

@@ -1,4 +1,5 @@
-"""Which Gaussians photos show to be surroundings, though depths and boxes took them for the object, or the other way.
+"""Which Gaussians photos show to be surroundings, though depths and boxes took them for the object, the other way, or
+to be both.
 
 docs/method.md, "Where views are filled".
 """
@@ -22,7 +23,7 @@ from .witness import total_over
 ROUNDS = 1, 2  # times a photo's size at which it is cut, from what the round before found in all; larger cuts lose less
 MOSTLY = 0.5  # share of blend weight in a pixel that decides: the majority
 PURE = 0.7  # share from which a pixel has nobody else's colour
-LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's
+LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's, too
 SOME = 0.25  # share from which the next round begins with it as the object's
 MARGIN = 12  # px round the boxes whose colours are the surroundings' for certain
 LARGEST = 512  # px, longest side of what is cut at once: colours need no more
@@ -38,20 +39,33 @@ class Sight(NamedTuple):
     marked: np.ndarray  # bool, what the user named beside the object: its colours are the surroundings', yet it goes
 
 
+class Shown(NamedTuple):
+    """What photos show of Gaussians; [N] bool but for the last two."""
+
+    beside: np.ndarray  # beside the object, of those that may be surroundings
+    object_: np.ndarray  # as the object, of those in the boxes that yet would be left
+    both: np.ndarray  # of both: more beside the object than not, yet some of it
+    share: np.ndarray  # [N] of the weight that is shown, that on the object
+    photos: list[tuple[Camera, np.ndarray]]  # and where photos show what is beside the object, [H, W] bool
+
+
 def shown_beside(
     scene: Gaussians, goes: np.ndarray, stays: np.ndarray, may: np.ndarray, sights: Sequence[Sight]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of the rows that `may` be surroundings those that photos show beside the object; and of those in the boxes, that
-    yet would be left, those that they show as it. All [N] bool.
+) -> Shown:
+    """What photos show of the rows that go, though they `may` be surroundings, and of those that would be left in the
+    boxes; all [N] bool.
 
     Each photo is cut by its colours into the object and the rest (GrabCut, Rother et al. 2004): of what `goes`, as it
     is drawn there, what may be nothing else is the object's for certain. Once more, from what in the boxes all photos
     show as the object's to some share: so they tell each other.
     """
-    begins, sure, (beside, object_) = goes, goes & ~may, np.zeros((2, len(scene)), bool)
-    in_boxes, sights = goes | stays, [sight for sight in sights if sight.polygon.any()]
+    begins, sure, in_boxes = goes, goes & ~may, goes | stays
+    sights = [sight for sight in sights if sight.polygon.any()]
+    elsewhere, on_object = np.zeros((2, len(scene)))
+    clear = [s.polygon for s in sights]
 
-    def of(size: float, sight: Sight) -> np.ndarray:
+    def of(size: float, k: int) -> np.ndarray:
+        sight = sights[k]
         drawn = drawing(scene, sight.camera, with_colour=False, pixels=sight.polygon)
         certain = cv2.erode((drawn.footprint(sure) > PURE).astype(np.uint8), np.ones((3, 3))) > 0
         start = np.full(sight.polygon.shape, cv2.GC_BGD, np.uint8)
@@ -62,16 +76,20 @@ def shown_beside(
         window = _window(sight.polygon)
         labels = np.where(sight.marked, OBJECT, ELSE).astype(np.uint8)
         labels[window][_cut(sight.photo[window], start[window], size)] = OBJECT
+        clear[k] = labels == ELSE
         return label_weights(scene, sight.camera, labels, OBJECT, in_boxes | may)
 
     for size in ROUNDS:
-        elsewhere, on_object = total_over(sights, partial(of, size), (OBJECT, len(scene)))
+        elsewhere, on_object = total_over(range(len(sights)), partial(of, size), (OBJECT, len(scene)))
         shown = elsewhere + on_object
-        beside = may & (shown > LEAST_WEIGHT) & (on_object <= LEAST * shown)
-        object_ = stays & (shown > LEAST_WEIGHT) & (on_object > MOSTLY * shown)
         sure = sure | (in_boxes & (on_object > MOSTLY * shown))
         begins = in_boxes & (on_object > SOME * shown)
-    return beside, object_
+    shown = elsewhere + on_object
+    share = on_object / np.maximum(shown, LEAST_WEIGHT)
+    told, some, mostly = shown > LEAST_WEIGHT, share > LEAST, share > MOSTLY
+    both = ((goes & may) | stays) & told & some & ~mostly
+    photos = [(s.camera, beside) for s, beside in zip(sights, clear)]
+    return Shown(may & told & ~some, stays & told & mostly, both, share, photos)
 
 
 def _window(polygon: np.ndarray) -> Window:

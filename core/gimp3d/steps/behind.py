@@ -36,6 +36,7 @@ from ..stages.reflection import Reflection, find_reflection
 from ..stages.seed import OWN_RULES
 from ..stages.selection import Fate, Selection, near_region
 from ..stages.shadow import Shadow, find_contact, find_shadow, marked_shadow
+from ..stages.splitting import split_at_outline
 from ..stages.witness import Witness, total_over
 from .references import emptied
 
@@ -70,6 +71,8 @@ class Surfaces:
     marked: tuple[np.ndarray, ...]  # [H, W] bool, what the user named beside the object, and what is too dark to lift
     confidence: float
     reason: str
+    scene: Gaussians  # what photos show as the object's and as its surroundings' is split; the object's parts come last
+    split: np.ndarray  # [M] of its rows, that are the surroundings' parts
 
     def witnesses(self, views: Sequence[ViewState], wary: bool = False) -> list[Witness]:
         """The views; with `wary`, of nothing that may be a foot: its colours do not tell it from a fold."""
@@ -99,8 +102,8 @@ def find_surfaces(
     marked = tuple(v.silhouette & v.target & (v.depth_before == 0) & (v.alpha_before > 0) for v in masks.views)
 
     objects, selection = parallel_map(lambda v: pixels_of(v.weight, settings.clearing), masks.views), masks.selection
-    none = np.zeros(len(scene), bool)
-    found = Surfaces((), (), selection, none, objects, objects, marked, 1.0, "")
+    none, split = np.zeros(len(scene), bool), np.zeros(0, int)
+    found = Surfaces((), (), selection, none, objects, objects, marked, 1.0, "", scene, split)
     witnesses = found.witnesses(views)
     planes = find_planes(witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, witnesses, region, settings.charts)
@@ -115,17 +118,27 @@ def find_surfaces(
     sights = [Sight(v.camera, s.bare, v.polygon, m) for v, s, m in looks if v.camera.id in asked]
     goes = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
     stays = np.isin(selection.fates, LEFT)
-    beside, object_ = shown_beside(scene, goes, stays, may, sights)
-    back, removed = selection.removed & beside, (selection.removed & ~beside) | object_
-    if back.any() or object_.any():
-        fates = np.where(back, np.uint8(Fate.KEPT_SURFACE), selection.fates)
-        fates[object_] = Fate.REMOVED_STRADDLING
-        objects, doubtful = (
-            object_pixels(scene, rows, masks.views, settings.clearing) for rows in (removed, removed | (back & ~sunk))
-        )
-        reason += f", {int(back.sum())} Gaussians are shown beside it and stay, {int(object_.sum())} as it and go"
-        found = replace(found, selection=Selection(fates), objects=objects, doubtful=doubtful, reason=reason)
-    return replace(found, beside=beside)
+    shown = shown_beside(scene, goes, stays, may, sights)
+    finite = np.isfinite(scene.opacity_logits) & np.isfinite(scene.log_scales).all(1)
+    both = shown.both & scene.usable & finite & (scene.scales.max(1) < LARGEST * extent(region))
+    fates = np.where(shown.object_, np.uint8(Fate.REMOVED_STRADDLING), selection.fates)
+    fates[selection.removed & (shown.beside | both)] = Fate.KEPT_SURFACE
+    back, gone, split = selection.removed & (fates == Fate.KEPT_SURFACE), int(shown.object_.sum()), np.flatnonzero(both)
+    if not (back.any() or gone or len(split)):
+        return replace(found, beside=shown.beside)
+    if len(split):
+        rest, parts = split_at_outline(scene.take(split), shown.share[split], shown.photos)
+        scene = scene.with_rows(split, rest).extended(parts)
+    more = np.zeros(len(split), bool)
+    selection = Selection(np.append(fates, np.full(len(split), np.uint8(Fate.REMOVED_STRADDLING))))
+    wary = selection.removed | np.append(back & ~sunk, more)
+    objects, doubtful = (
+        object_pixels(scene, rows, masks.views, settings.clearing) for rows in (selection.removed, wary)
+    )
+    reason += f", {int((back & ~both).sum())} Gaussians are shown beside it and stay, {gone} as it and go"
+    reason += f", {len(split)} are both and split"
+    found = replace(found, selection=selection, objects=objects, doubtful=doubtful, reason=reason)
+    return replace(found, beside=np.append(shown.beside, more), scene=scene, split=split)
 
 
 @dataclass(frozen=True)

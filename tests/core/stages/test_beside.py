@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scenes import BLOCK, REGION, block, cameras, floor
+from scenes import BLOCK, REGION, block, cameras, discs, floor
 
 from gimp3d.gaussians import Gaussians
-from gimp3d.raster import render_bytes
+from gimp3d.raster import footprint, render_bytes
 from gimp3d.stages import beside
 from gimp3d.stages.beside import Sight, shown_beside
 from gimp3d.stages.look import box_polygon, fill_polygon
@@ -43,13 +43,13 @@ def weight(rows: np.ndarray) -> float:
 
 
 def test_floor_that_a_box_took_is_shown_beside_the_object_and_its_foot_is_not() -> None:
-    found, object_ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
+    found, object_, *_ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
     assert found[OUTER].mean() > 0.9 and not found[OBJECT].any()
     assert not found[~MAY].any() and not object_.any()
 
 
 def test_of_what_stays_it_tells_too() -> None:
-    found, _ = shown_beside(SCENE, OBJECT, NONE, MAY, sights())
+    found = shown_beside(SCENE, OBJECT, NONE, MAY, sights()).beside
     away = MAY & ~OBJECT & (np.abs(SCENE.means[:, :2]).max(1) > BLOCK / 2 + 0.1)
     near = away & (np.abs(SCENE.means[:, :2]).max(1) < BLOCK)
     assert found[near].all()
@@ -57,7 +57,7 @@ def test_of_what_stays_it_tells_too() -> None:
 
 def test_a_foot_that_was_taken_for_the_floor_is_shown_as_the_object() -> None:
     foot = OBJECT & MAY
-    _, object_ = shown_beside(SCENE, OBJECT & ~MAY, foot | RING, MAY, sights())
+    object_ = shown_beside(SCENE, OBJECT & ~MAY, foot | RING, MAY, sights()).object_
     seen = foot & (np.abs(SCENE.means[:, :2]).max(1) > 0.9 * BLOCK / 2)
     assert object_[seen].mean() > 0.9 and not object_[OUTER].any()
     assert not object_[~(foot | RING)].any()
@@ -66,7 +66,7 @@ def test_a_foot_that_was_taken_for_the_floor_is_shown_as_the_object() -> None:
 def test_what_stands_clear_of_the_floor_is_never_the_floors_and_tells_of_its_foot() -> None:
     """An object of the floor's own colours: little of its foot is taken for the floor."""
     grey = replace(SCENE, sh=np.where(OBJECT[:, None, None], SURROUNDINGS.sh.mean(0), SCENE.sh).astype(np.float32))
-    found, _ = shown_beside(grey, OBJECT | RING, NONE, MAY, sights(grey))
+    found = shown_beside(grey, OBJECT | RING, NONE, MAY, sights(grey)).beside
     assert found[OBJECT & MAY].mean() < 0.1
 
 
@@ -78,9 +78,9 @@ def test_what_is_marked_goes_whatever_its_colours_say() -> None:
 
 def test_large_photos_are_cut_small(monkeypatch: pytest.MonkeyPatch) -> None:
     large = sights(scale=2)
-    whole, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large)
+    whole = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large).beside
     monkeypatch.setattr(beside, "LARGEST", 100)
-    small, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large)
+    small = shown_beside(SCENE, OBJECT | RING, NONE, MAY, large).beside
     assert weight(whole ^ small) < 0.15 and not small[OBJECT].any()
 
 
@@ -97,23 +97,46 @@ def test_what_most_photos_show_as_the_object_is_so_for_certain_in_the_next_cut(m
         return np.full(start.shape, not wrong)
 
     monkeypatch.setattr(beside, "_cut", cut)
-    found, _ = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
+    found = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights()).beside
     assert sorted(cuts) == [1] * len(sights()) + [2] * len(sights())
     assert certain[2] > 1.1 * certain[1] and not found[OBJECT | RING].any()
 
 
 def test_it_tells_the_same_each_time() -> None:
     first, again = (shown_beside(SCENE, OBJECT | RING, RING, MAY, sights()) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
+    for one, other in zip(first[:4], again[:4]):
+        np.testing.assert_array_equal(one, other)
+    for (_, one), (_, other) in zip(first.photos, again.photos, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_reaches_under_the_foot_is_both() -> None:
+    """Some of it shows on either side of the outline; photos tell how much, and where the outline is."""
+    at = np.array([[BLOCK / 2 + off, 0, 0.005] for off in (0.03, 0.3)])
+    large = discs(at, (0, 0, 1), np.full((2, 3), 0.6), 0.08)
+    scene = SCENE.extended(large)
+    rows, none = np.arange(len(scene)) - len(SCENE), np.zeros(len(scene), bool)
+    may, object_ = np.append(MAY, np.ones(2, bool)), np.append(OBJECT, np.zeros(2, bool))
+    taken, left = (
+        shown_beside(scene, goes, stays, may, sights(scene))
+        for goes, stays in ((object_ | (rows >= 0), none), (object_, rows >= 0))
+    )
+    for shown in (taken, left):
+        assert list(rows[shown.both & (rows >= 0)]) == [0] and shown.share[-2] > 0.1 > shown.share[-1]
+        assert not (shown.both & (shown.beside | shown.object_)).any()
+    assert not shown_beside(scene, object_, none, may, sights(scene)).both[-2:].any()  # nobody asked
+    truth = [footprint(scene, s.camera, object_) > 0.5 for s in sights(scene)]
+    assert np.mean([(b == ~t)[t | s.polygon].mean() for (_, b), t, s in zip(taken.photos, truth, sights(scene))]) > 0.9
 
 
 @pytest.mark.parametrize("goes", [np.zeros(len(SCENE), bool), np.ones(len(SCENE), bool)])
 def test_photos_that_show_one_thing_only_are_no_error(goes: np.ndarray) -> None:
-    found, object_ = shown_beside(SCENE, goes, ~goes, MAY, sights()[:2])
+    found, object_, *_ = shown_beside(SCENE, goes, ~goes, MAY, sights()[:2])
     assert found.shape == goes.shape == object_.shape and not found[~MAY].any()
 
 
 def test_without_views_nothing_is_shown() -> None:
-    assert not np.any(shown_beside(SCENE, OBJECT, RING, MAY, []))
     empty = [s._replace(polygon=np.zeros_like(s.polygon)) for s in sights()]
-    assert not np.any(shown_beside(SCENE, OBJECT, RING, MAY, empty))
+    for none in ([], empty):
+        shown = shown_beside(SCENE, OBJECT, RING, MAY, none)
+        assert not np.any(shown[:4]) and not shown.photos
