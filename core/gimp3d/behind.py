@@ -74,14 +74,14 @@ def look_behind(
 
     def in_light(found: Relit, suffix: str = "") -> tuple[Relit, Surfaces, Charted]:
         """What the object does to the light undone, and the surfaces and their charts as they are then."""
-        light = run(f"lift{suffix}", undo_light, surfaces.scene, surfaces, views, found) if found.effects else None
+        light = run(f"lift{suffix}", undo_light, surfaces, views, found) if found.effects else None
         lit = replace(found, lifted=light)
         bounded = surfaces if light is None else surfaces.with_marked(light.dark)
         return lit, bounded, run(f"charts{suffix}", chart_surfaces, region, bounded, lit.views(views))
 
     found = NOT_LIT
     if settings.shadow != "off":
-        found = run("light", find_light, surfaces.scene, region, surfaces, views, shadow_masks, settings)
+        found = run("light", find_light, region, surfaces, views, shadow_masks, settings)
         if isinstance(found.shadow, str) and settings.shadow == "mask":
             run.warnings.append(found.shadow)
     lit, bounded, charted = in_light(found)

@@ -56,10 +56,11 @@ def truncated(gaussians: Gaussians, towards: np.ndarray, share: np.ndarray) -> G
     values, vectors = np.linalg.eigh(covariance)
     values, vectors = values[:, ::-1], vectors[..., ::-1]  # a surfel's normal is the last axis
     vectors = vectors * np.where(np.linalg.det(vectors) < 0, -1.0, 1.0)[:, None, None]
-    opacity = gaussians.opacity.astype(np.float64) * np.minimum(1, (1 - share) / np.sqrt(spread))
+    mass = np.minimum(1, (1 - share) / np.sqrt(spread))
     least = spread[:, None] * np.exp(2 * gaussians.log_scales.min(1, keepdims=True).astype(np.float64))
     scales = np.log(np.maximum(values[:, : gaussians.log_scales.shape[1]], least)) / 2
-    logits = np.log(opacity) - np.log1p(-opacity)
+    with np.errstate(divide="ignore"):  # the logit of mass times the opacity
+        logits = np.log(mass) - np.logaddexp(np.log1p(-mass), -gaussians.opacity_logits.astype(np.float64))
     return replace(
         gaussians,
         means=(gaussians.means + ahead[:, None] * along).astype(gaussians.means.dtype),

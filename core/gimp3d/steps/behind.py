@@ -238,7 +238,6 @@ def _words(*found: Shadow | Reflection | str) -> str:
 
 
 def find_light(
-    scene: Gaussians,
     region: Region,
     surfaces: Surfaces,
     views: Sequence[ViewState],
@@ -246,7 +245,7 @@ def find_light(
     settings: RemovalSettings,
 ) -> Relit:
     """Look for the object's reflection, and in photos without that for its shadow."""
-    gone = scene.take(surfaces.selection.removed)
+    gone = surfaces.scene.take(surfaces.selection.removed)
     planes = support_first(surfaces.planes, gone)
     if not planes:
         none = "no surface is known round the object"
@@ -264,10 +263,10 @@ def find_light(
     return Relit(reflection, shadow)
 
 
-def undo_light(scene: Gaussians, surfaces: Surfaces, views: Sequence[ViewState], found: Relit) -> Lifted:
+def undo_light(surfaces: Surfaces, views: Sequence[ViewState], found: Relit) -> Lifted:
     """Subtract the reflection, then lift the shadows, in photos and in splats; one of them at least is found."""
     shadows = [s for s in (found.shadow, found.contact) if isinstance(s, Shadow)]
-    return lift(scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, shadows)
+    return lift(surfaces.scene, surfaces.selection.removed, surfaces.witnesses(views), found.reflection, shadows)
 
 
 def with_contact(found: Relit, charts: Sequence[Chart]) -> Relit:

@@ -157,10 +157,18 @@ def test_floor_that_selection_took_is_no_object_in_photos() -> None:
     levelled = Exposure(np.ones(3))
     views = [ViewState.first(v, photo, levelled) for v, photo in zip(plain.views, photos)]
     found = find_surfaces(whole, REGION, masks, views, PRESETS["balanced"])
-    back = ring & (found.selection.fates == Fate.KEPT_SURFACE)
+    fates = found.selection.fates[: len(whole)]
+    back = ring & (fates == Fate.KEPT_SURFACE)
     outside = np.abs(plain.scene.means[:, :2]).max(1) > BLOCK / 2 + 0.06
     assert back[ring & outside].mean() > 0.9
-    assert found.selection.removed[plain.selection.removed & ~ring].all()
+    assert (fates >= Fate.REMOVED_INSIDE)[plain.selection.removed & ~ring].all()
+    # what reaches under the block is split: it stays in its place, and its other part goes
+    parts, split = np.arange(len(whole), len(found.scene)), found.split
+    assert len(parts) == len(split) > 0 and found.selection.removed[parts].all() and ring[split].all()
+    off = [np.abs(found.scene.means[rows, :2]).max(1).mean() for rows in (parts, split)]
+    assert off[0] < np.abs(whole.means[split, :2]).max(1).mean() < off[1]
+    same = np.setdiff1d(np.arange(len(whole)), split)
+    np.testing.assert_array_equal(found.scene.means[same], whole.means[same])
     for view, (hidden, _), witness in zip(plain.views, found.objects, plain.witnesses):
         taken_for_it = footprint(whole, view.camera, Selection(taken).removed) > 0.5
         assert (taken_for_it & ~witness.hidden).sum() > 5 * (hidden & ~dilated(witness.hidden, 3)).sum()
@@ -309,6 +317,8 @@ def test_without_charts_there_is_no_confidence(plain: Removal) -> None:
     views = [ViewState.first(v, w.photo, Exposure(np.ones(3))) for v, w in zip(plain.views, plain.witnesses)]
     objects = [(w.hidden, w.beside) for w in plain.witnesses]
     none = np.zeros(len(plain.scene), bool)
-    surfaces = Surfaces((), (), plain.selection, none, objects, objects, (NONE,) * len(EYES), 1.0, "")
+    surfaces = Surfaces(
+        (), (), plain.selection, none, objects, objects, (NONE,) * len(EYES), 1.0, "", plain.scene, np.zeros(0, int)
+    )
     found = chart_surfaces(REGION, surfaces, views)
     assert not found.charts and found.confidence == 0 and found.reason.startswith("no surface")

@@ -31,7 +31,7 @@ def prepared() -> tuple[list[Witness], Shadow]:
     exposures = exposures_of(lit.gaussians.take(~masks.removed), masks.views, photos)
     views = [ViewState.first(v, photos[v.camera.id], e) for v, e in zip(masks.views, exposures)]
     surfaces = find_surfaces(lit.gaussians, lit.region, masks, views, settings)
-    found = find_light(lit.gaussians, lit.region, surfaces, views, {}, settings)
+    found = find_light(lit.region, surfaces, views, {}, settings)
     assert not isinstance(found.shadow, str)
     return surfaces.witnesses(views), found.shadow
 
