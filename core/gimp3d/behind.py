@@ -100,7 +100,7 @@ def look_behind(
         cleared = run("clear", clear_round, scene, region, bounded, charted.charts, views, settings)
         masks = replace(masks, selection=cleared.selection, views=tuple(m for m, _ in cleared.targets))
         views = tuple(replace(v, masks=m, left=m, hits=h) for v, (m, h) in zip(views, cleared.targets))
-    changed = np.union1d(lit.rows, surfaces.split)
+    changed = np.setdiff1d(np.union1d(lit.rows, surfaces.split), np.flatnonzero(masks.removed))
     behind = Behind(scene, scene, changed, masks, views, charted.charts, lit, len(surfaces.split))
     if not settings.refine.steps:
         return behind

