@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -92,12 +92,13 @@ def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray, sure: np.nd
         along, across = turn_of(-angles[k])
         offset = row - heart
         cut = (places @ along)[np.abs(places @ across - offset) <= 1]
-        edge = None
+        edges: Sequence[Edge | _Half] = []
         if cut.max() - cut.min() >= LEAST_CUT * scale:
             place = ((offset * across + middle) + 0.5) / scale - 0.5
-            edge = _settled(picture, (known, sure), hole, angles[k], place, side)
-        if edge is not None:
-            found.append(edge)
+            settled = partial(_settled, picture, (known, sure), hole, angles[k], place)
+            edge = settled(side)
+            edges = [edge] if edge is not None else _bent(settled) if side == BOTH else []
+        found += edges
         ways = (cut.min(), along), (cut.max(), -along)
         for end, inwards in (ways, ways[:1], ways[1:])[side]:
             place = offset * across + end * along
@@ -105,7 +106,7 @@ def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray, sure: np.nd
                 axes = turn_of(-angle)
                 beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
                 here = BEFORE if inwards @ axes[0] > 0 else AFTER
-                told[other, [[BOTH], [here if edge is not None or side != BOTH else BOTH]], beside] = 0
+                told[other, [[BOTH], [here if edges or side != BOTH else BOTH]], beside] = 0
     whole = [edge for edge in found if isinstance(edge, Edge)]
     halves = _joined([half for half in found if isinstance(half, _Half)], hole)
     return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *halves]]
@@ -127,10 +128,11 @@ class _Half:
         return self.edge.origin + self.enters * self.edge.along
 
     def faces(self, other: _Half) -> bool:
-        """Whether the other one runs into the hole where this one leaves it, among the pixels by which it is told."""
+        """Whether the other one runs into the hole where this one leaves it, as exactly as its direction is told."""
         x, y = other.entry - self.edge.origin
         aside = abs(x * self.edge.along[1] - y * self.edge.along[0])
-        return aside <= ROWS[BELOW].max() and (other.entry - self.entry) @ self.edge.along * self.inwards > 0
+        way = (other.entry - self.entry) @ self.edge.along * self.inwards
+        return bool(way > 0 and aside <= ROWS[BELOW].max() + way * math.radians(ANGLE))
 
     def until(self, t: float) -> Edge:
         first, last = self.edge.ends
@@ -182,6 +184,13 @@ def _straight(one: _Half, other: _Half) -> tuple[float, float, float] | None:
     middle = (one.entry + other.entry) / 2
     t, u = (float((middle - half.edge.origin) @ half.edge.along) for half in (one, other))
     return float(np.linalg.norm(one.entry - other.entry)), t, u
+
+
+def _bent(settled: Callable[[int, float], Edge | _Half | None]) -> list[Edge]:
+    """An edge that no one straight line follows on both sides: each side's own, as far as the middle between them."""
+    halves = [half for side in (BEFORE, AFTER) if isinstance(half := settled(side, TELLS), _Half)]
+    meeting = _straight(*halves) if len(halves) == 2 else None
+    return [half.until(t) for half, t in zip(halves, meeting[1:])] if meeting is not None else []
 
 
 def _ways(one: _Half, other: _Half) -> tuple[np.ndarray, np.ndarray]:
@@ -252,6 +261,7 @@ def _settled(
     angle: float,
     place: np.ndarray,
     side: int,
+    least: float = HALF_TELLS,  # by which it must be told on one side
 ) -> Edge | _Half | None:
     """The edge at full resolution: turned and shifted to where it is told best."""
     rows, cols = np.nonzero(hole)
@@ -295,7 +305,7 @@ def _settled(
 
     for reach in (REACH, SOON)[: 1 + (side != BOTH)]:
         told, found = pattern_search(partial(at, reach=reach), np.eye(2))
-        if found is not None and told >= (TELLS if side == BOTH else HALF_TELLS):
+        if found is not None and told >= (TELLS if side == BOTH else least):
             return found
     return None
 
