@@ -1,6 +1,7 @@
-"""Straight edges that a hole cuts: each is told on both sides of it, and runs straight on in between.
+"""Edges that a hole cuts: each is told on both sides of it, and runs straight on in between.
 
-One that is told on one side only runs on until it meets another, of the same line or corner, or what is not known.
+One that is told on one side only runs on until it meets another, of the same line, curve or corner, or what is not
+known.
 
 What is large is continued before what is small (structure propagation: Sun, Yuan, Jia and Shum 2005).
 """
@@ -40,7 +41,12 @@ APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
 MOST = 8  # edges of a part of the hole
 BOTH, BEFORE, AFTER = range(3)  # the sides of the hole on which an edge is told
-TURN = 0.5  # sine of the angle that two edges that meet have at least
+TURN = math.radians(30)  # by which an edge turns at least at a corner, and by which less than straight back
+LEAST_BOW = (
+    0.25  # share of a circle's bend that beside the hole tells it: up to 0.1 is seen at corners, 0.3 to 1 on circles
+)
+BOWS = np.linspace(-0.01, 0.01, 17)  # 1/px, by which an edge may bend
+PIECES = 6  # straight ones of a curve
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,12 @@ class _Half:
     enters: float  # px along it, where it runs into the hole
     leaves: float  # and out of it, or ends beyond
     goes_on: bool  # what is known beyond the hole does not tell that it ends
+    bow: float  # 1/px, by which it bends to its right where it is told, on its way into the hole
+
+    @property
+    def way(self) -> np.ndarray:
+        """[2] unit, into the hole."""
+        return self.inwards * self.edge.along
 
     @property
     def entry(self) -> np.ndarray:
@@ -129,52 +141,73 @@ class _Half:
 
     def faces(self, other: _Half) -> bool:
         """Whether the other one runs into the hole where this one leaves it, as exactly as its direction is told."""
-        x, y = other.entry - self.edge.origin
-        aside = abs(x * self.edge.along[1] - y * self.edge.along[0])
-        way = (other.entry - self.entry) @ self.edge.along * self.inwards
-        return bool(way > 0 and aside <= ROWS[BELOW].max() + way * math.radians(ANGLE))
+        apart = other.entry - self.entry
+        far = apart @ self.way
+        return bool(far > 0 and abs(_cross(apart, self.way)) <= ROWS[BELOW].max() + far * math.radians(ANGLE))
 
-    def until(self, t: float) -> Edge:
-        first, last = self.edge.ends
+    def until(self, far: float) -> Edge:
+        """As far as so many px behind where it runs into the hole."""
+        t, (first, last) = self.enters + self.inwards * far, self.edge.ends
         return replace(self.edge, ends=(first, t) if self.inwards > 0 else (t, last))
 
 
+_Meeting = tuple[float, list[Edge]]  # px of the way past where two edges meet, and both as far as there
+
+
 def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
-    """Pairs as far as where they meet: at corners in the hole or next to it, else in the middle of straight lines,
-    nearest first; others as far as what is not known.
+    """Pairs as far as where they meet: at corners in the hole or next to it and on curves, else in the middle of
+    straight lines, nearest first; others as far as what is not known.
     """
     meetings, place = [], dilated(hole, CLOSE)
     for (k, one), (j, other) in itertools.combinations(enumerate(halves), 2):
-        for straight, meeting in enumerate((_corner(one, other, place), _straight(one, other))):
-            if meeting is not None:
-                way, t, u = meeting
-                meetings.append((straight, way, {k: one.until(t), j: other.until(u)}))
-    found: dict[int, Edge] = {}
-    for *_, pair in sorted(meetings, key=lambda m: m[:2]):
-        if not found.keys() & pair.keys():
-            found |= pair
-    for k, half in enumerate(halves):
-        if k not in found and half.goes_on and abs(half.leaves - half.enters) >= LEAST:
-            found[k] = half.until(half.leaves)
-    return list(found.values())
+        straight = _straight(one, other)
+        meeting = _turning(one, other, place) if straight is None else straight
+        if meeting is not None:
+            meetings.append((straight is not None, *meeting, {k, j}))
+    found: list[Edge] = []
+    joined: set[int] = set()
+    for *_, edges, pair in sorted(meetings, key=lambda m: m[:2]):
+        if not joined & pair:
+            joined |= pair
+            found += edges
+    rest = [half for k, half in enumerate(halves) if k not in joined and half.goes_on]
+    through = [abs(half.leaves - half.enters) for half in rest]
+    return found + [half.until(far) for half, far in zip(rest, through) if far >= LEAST]
 
 
-def _corner(one: _Half, other: _Half, place: np.ndarray) -> tuple[float, float, float] | None:
-    """The way round a corner that lies in `place`, [H, W] bool, and how far on each edge it is."""
-    a, b = one.edge, other.edge
-    turn = a.along[0] * b.along[1] - a.along[1] * b.along[0]
-    if abs(turn) < TURN or not _alike(*_ways(one, other)):
+def _turning(one: _Half, other: _Half, place: np.ndarray) -> _Meeting | None:
+    """One edge that turns where two lines meet in `place`, [H, W] bool: at a corner, or on a curve if it turns little
+    or bends beside the hole as the circle does that joins them.
+    """
+    into, out, apart = one.way, -other.way, other.entry - one.entry
+    turn = math.atan2(_cross(into, out), into @ out)
+    if turn == 0 or abs(turn) > math.pi - TURN or not _alike(*_ways(one, other)):
         return None
-    apart = b.origin - a.origin
-    t, u = ((apart[0] * d[1] - apart[1] * d[0]) / turn for d in (b.along, a.along))
-    x, y = np.rint(a.origin + t * a.along).astype(int)
-    ways = (t - one.enters) * one.inwards, (u - other.enters) * other.inwards
-    meets = min(ways) >= 0 and 0 <= y < place.shape[0] and 0 <= x < place.shape[1] and place[y, x]
-    return (sum(ways), t, u) if meets else None
+    ways = _cross(apart, out) / math.sin(turn), _cross(into, apart) / math.sin(turn)
+    meeting = one.entry + ways[0] * into
+    x, y = np.rint(meeting).astype(int)
+    if min(ways) < 0 or not (0 <= y < place.shape[0] and 0 <= x < place.shape[1] and place[y, x]):
+        return None
+    bends = (one.bow - other.bow) / 2 / (2 * math.tan(turn / 2) / (sum(ways) + SOON)) >= LEAST_BOW
+    edges = [half.until(far) for half, far in zip((one, other), ways)]
+    return sum(ways), _curve(one, other, meeting) if bends or abs(turn) < TURN else edges
 
 
-def _straight(one: _Half, other: _Half) -> tuple[float, float, float] | None:
-    """The way between two that run towards each other on one line, and how far on each edge its middle is.
+def _curve(one: _Half, other: _Half, meeting: np.ndarray) -> list[Edge]:
+    """Two edges as far as where they are told, and the parabola between that touches both, in straight pieces."""
+    ends = [half.entry - SOON / 2 * half.way for half in (one, other)]
+    at = np.linspace(0, 1, PIECES + 1)[:, None]
+    line = (1 - at) ** 2 * ends[0] + 2 * at * (1 - at) * meeting + at**2 * ends[1]
+    pieces, steps = [half.until(-SOON / 2) for half in (one, other)], _ways(one, other)
+    for k, (start, end) in enumerate(itertools.pairwise(line)):
+        far, share = float(np.linalg.norm(end - start)), (k + 0.5) / PIECES
+        step, mean = ((1 - share) * a + share * b for a, b in (steps, (one.edge.mean, other.edge.mean)))
+        pieces.append(Edge(start, (end - start) / far, (0.0, far), step, mean))
+    return pieces
+
+
+def _straight(one: _Half, other: _Half) -> _Meeting | None:
+    """Two that run towards each other on one line, as far as the middle between them.
 
     Grain and light change beside a border, its line does not. Where colours only change sides another edge crosses it.
     """
@@ -182,15 +215,20 @@ def _straight(one: _Half, other: _Half) -> tuple[float, float, float] | None:
     if not (one.faces(other) and other.faces(one)) or _alike(there, -back):
         return None
     middle = (one.entry + other.entry) / 2
-    t, u = (float((middle - half.edge.origin) @ half.edge.along) for half in (one, other))
-    return float(np.linalg.norm(one.entry - other.entry)), t, u
+    edges = [half.until(float((middle - half.entry) @ half.way)) for half in (one, other)]
+    return float(np.linalg.norm(one.entry - other.entry)), edges
 
 
 def _bent(settled: Callable[[int, float], Edge | _Half | None]) -> list[Edge]:
     """An edge that no one straight line follows on both sides: each side's own, as far as the middle between them."""
     halves = [half for side in (BEFORE, AFTER) if isinstance(half := settled(side, TELLS), _Half)]
     meeting = _straight(*halves) if len(halves) == 2 else None
-    return [half.until(t) for half, t in zip(halves, meeting[1:])] if meeting is not None else []
+    return meeting[1] if meeting is not None else []
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    """Positive if b [2] lies to the right of a [2]."""
+    return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _ways(one: _Half, other: _Half) -> tuple[np.ndarray, np.ndarray]:
@@ -273,14 +311,18 @@ def _settled(
 
     def at(values: np.ndarray, reach: int) -> tuple[float, Edge | _Half | None]:
         along, across = turn_of(-angle - values[0])
-        origin = heart + values[1] * across
+        return line(heart + values[1] * across, along, reach)
+
+    def line(origin: np.ndarray, along: np.ndarray, reach: int, bow: float = 0.0) -> tuple[float, Edge | _Half | None]:
+        across = np.array([-along[1], along[0]])
         cut = ((pixels - origin) @ along)[np.abs((pixels - origin) @ across) <= 2]
         if not len(cut):
             return 0.0, None
         ways = [start + step * np.arange(FURTHEST) for start, step in ((cut.min() - 1, -1), (cut.max() + 1, 1))]
         lines = []  # what lies beside it on either side of the hole
         for t, tell in zip(ways, tells):
-            grid = origin + t[None, :, None] * along + ROWS[:, None, None] * across
+            bows = bow / 2 * ((t - t[reach // 2]) ** 2 - reach**2 / 12)
+            grid = origin + t[None, :, None] * along + (ROWS[:, None, None] + bows[:, None]) * across
             x, y = np.ascontiguousarray(grid.transpose(2, 0, 1), np.float32)
             shows = cv2.remap(known if tell else sure, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             colours = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -301,11 +343,15 @@ def _settled(
         enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
         seen = _goes_on(beyond[:, :CLOSE], telling[0])
         dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-        return told, _Half(edge, inwards, enters, leaves + inwards * CLOSE * seen, bool(seen or dark))
+        leaves += inwards * CLOSE * seen
+        return told, _Half(edge, inwards, enters, leaves, bool(seen or dark), 0.0)
 
     for reach in (REACH, SOON)[: 1 + (side != BOTH)]:
         told, found = pattern_search(partial(at, reach=reach), np.eye(2))
         if found is not None and told >= (TELLS if side == BOTH else least):
+            if isinstance(found, _Half):
+                bow = max(BOWS, key=lambda bow: line(found.edge.origin, found.edge.along, reach, bow)[0])
+                return replace(found, bow=found.inwards * bow)
             return found
     return None
 

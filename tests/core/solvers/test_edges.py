@@ -196,3 +196,44 @@ def test_a_straight_border_stays_straight_through_a_large_hole(seed: int) -> Non
     filled = complete_picture(np.where(hole[..., None], np.uint8(0), truth), hole)[0].astype(int)
     wrong = hole & ((filled[..., 1] - filled[..., 0] < 20) != (side_of(62, 4) > 0)) & (np.abs(side_of(62, 4)) > 2)
     assert wrong.sum() < 0.005 * hole.sum()
+
+
+def bowed(radius: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] each: px along a circle's tangent in the hole's middle, and below the circle."""
+    a = math.radians(angle)
+    along, below = math.cos(a) * X + math.sin(a) * Y, math.cos(a) * Y - math.sin(a) * X - 2
+    return along, below + radius - np.sqrt(np.maximum(radius**2 - along**2, 0))
+
+
+def off(edges, below: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """px by which edges miss where `below` [H, W] is 0, every half px along them in the hole."""
+    lines = [e.origin + t * e.along for e in edges for t in np.arange(*e.ends, 0.5)]
+    x, y = np.rint(lines).astype(int).reshape(-1, 2).clip(0, SIDE - 1).T
+    return np.abs(below[y, x][HOLE[y, x]])
+
+
+@pytest.mark.parametrize("radius", [90, 120, 200, 300])
+@pytest.mark.parametrize("angle", [0, 40, 100])
+def test_a_curve_runs_on_round(radius: float, angle: float) -> None:
+    _, below = bowed(radius, angle)
+    edges = found(textured(np.where(below > 0, 120.0, 190.0), 5))
+    missed = off(edges, below)
+    assert len(missed) > 100 and missed.mean() < 1.5 and missed.max() < 3.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_border_that_is_not_quite_straight_runs_on(seed: int) -> None:
+    """As a mat's: no line is told on both sides, and neither side's runs out where the other's does."""
+    _, below = bowed(550, 90)
+    missed = off(found(textured(np.where(below > 0, 120.0, 190.0), 5, seed=seed)), below)
+    assert len(missed) > 90 and missed.max() < 4
+
+
+def test_what_is_wrong_next_to_the_hole_does_not_end_an_edge() -> None:
+    """Remains of the object in photos' pixels, where masks are too small."""
+    below = side_of(46, 4)
+    picture = textured(np.where(below > 0, 120.0, 190.0), 5)
+    wrong = (np.hypot(X, Y) < 42) & (np.abs(below) < 6) & (X < 0)
+    picture[wrong & (below <= 0)], picture[wrong & (below > 0)] = (190, 150, 255), (60, 50, 20)
+    edges = found(picture)
+    assert len(off(edges, below)) > 90 and off(edges, below).max() < 4
