@@ -30,6 +30,12 @@ def structured() -> dict[str, tuple[np.ndarray, np.ndarray]]:
             _share(lambda y, x: np.hypot(y - 1.15 * SIDE, x - 0.3 * SIDE) < 150), (90, 130, 90), (220, 205, 180)
         )
         + _grain(7, 5),
+        "plate": _mixed(
+            _share(lambda y, x: np.hypot(y - 0.9 * SIDE, x - 0.4 * SIDE) < 80),
+            (225, 225, 220),
+            (165, 115, 70) + _grain(14, 14, 3) + 8 * np.sin(0.35 * np.arange(SIDE))[:, None, None],
+        )
+        + _grain(15, 3),
         "book row": _books() + _grain(9, 3),
         "two mats and wood": _mats() + _grain(11, 3),
         "step": _mixed(_share(lambda y, x: _turned(y, x, 33)[0] > 3), (70, 60, 55), (200, 190, 175)) + _grain(12, 4),

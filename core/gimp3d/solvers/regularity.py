@@ -20,6 +20,8 @@ from ..geometry import colours_at, dilated
 SIDE = 96  # px: pictures are shrunk to this to find motions in
 ANGLES = sorted({360.0 * k / n for n in range(1, 13) for k in range(n)})  # degrees; of figures with up to 12 arms
 EXPLAINED = 0.97  # share of the variance that a motion must explain, of the surroundings and right beside the hole
+LOCALLY = 0.5  # share of the variance within some px, grain left out: a board's grain must not turn with a plate's rim
+GRAIN, LOCAL = 2.0, 6.0  # px, σ of what is left out and of what is some
 OVERLAP = 0.75  # share of the surroundings that it must map to something known
 TOLD = 0.2  # share of the hole that it must tell
 CANDIDATES = 3  # translations that are looked at for every angle
@@ -58,6 +60,7 @@ def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tupl
         return ()
     ratio = np.array([hole.shape[0] / size[1], hole.shape[1] / size[0]])
     picture, ring = image.astype(np.float32) / 255, _band(hole, known)
+    texture = _texture(picture, known)
 
     def motions(mirrored: bool) -> tuple[Motion, ...]:
         coarse = parallel_map(lambda angle: _of_turn(small, there, open_, band, angle, mirrored), ANGLES)
@@ -65,7 +68,7 @@ def find_motions(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tupl
         for _, angle, shift in sorted((c for of_turn in coarse for c in of_turn), key=lambda c: c[0])[:TRIED]:
             corner = turn_of(angle, mirrored).sum(1) / 2  # centres of pixels lie at p + 1/2 in either resolution
             found.append((angle, mirrored, ratio * (shift + 0.5 - corner) - 0.5 + corner))
-        settled = parallel_map(lambda f: _settled(picture, known, hole, ring, f), found)
+        settled = parallel_map(lambda f: _settled(picture, texture, known, hole, ring, f), found)
         return tuple(sorted((m for m in settled if m is not None), key=lambda m: -m.explained))
 
     return motions(mirrored=False) or motions(mirrored=True)
@@ -150,8 +153,24 @@ def _of_turn(
     return found
 
 
+def _texture(image: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The picture [H, W, 3] without its grain, and the variance [H, W] of that about each pixel, where it is known."""
+
+    def mean(values: np.ndarray, sigma: float) -> np.ndarray:
+        sums = cv2.GaussianBlur(np.dstack([values, np.ones(known.shape, np.float32)]) * known[..., None], (0, 0), sigma)
+        return sums[..., :-1] / np.maximum(sums[..., -1:], 1e-6)
+
+    smooth = mean(image, GRAIN)
+    return smooth, (mean(smooth**2, LOCAL) - mean(smooth, LOCAL) ** 2).sum(-1)
+
+
 def _settled(
-    image: np.ndarray, known: np.ndarray, hole: np.ndarray, band: np.ndarray, guess: tuple[float, bool, np.ndarray]
+    image: np.ndarray,
+    texture: tuple[np.ndarray, np.ndarray],
+    known: np.ndarray,
+    hole: np.ndarray,
+    band: np.ndarray,
+    guess: tuple[float, bool, np.ndarray],
 ) -> Motion | None:
     """The motion near a guess that explains most, if that is enough; it turns about the hole."""
     angle, mirrored, shift = guess
@@ -181,6 +200,13 @@ def _settled(
     tells = (_sample(shows, y, x) > 0.999).mean() >= TOLD
     # where something ends at the hole, only its rim contradicts; where it is plain, something far off is explained
     if not tells or min(best, explained(values, rim, of_rim, 0)[0]) < EXPLAINED:
+        return None
+    rows, cols = ring
+    y, x = _mapped(*at(values), rows, cols)
+    both = _sample(shows, y, x) > 0.999
+    smooth, varies = texture[0], np.maximum(texture[1][rows, cols], PLAIN)
+    differs = ((_sample(smooth, y, x) - smooth[rows, cols]) ** 2).sum(-1)
+    if np.mean((differs / (2 * varies))[both]) > 1 - LOCALLY:
         return None
     return Motion(*at(values), best, 255 * math.sqrt(max(0.0, 1 - best) * 2 * of_ring / 3))
 
