@@ -148,6 +148,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "nothing is taken for regular": (("gimp3d.solvers.exemplar:find_motions", lambda *_: ()),),
     "halves of edges do not meet on a line": (("gimp3d.solvers.edges:_straight", lambda *_: None),),
     "no edge turns a corner, nor ends unseen": (("gimp3d.solvers.edges:_joined", lambda *_: []),),
+    "no edge is bent": (("gimp3d.solvers.edges:_curve", lambda *_: []), ("gimp3d.solvers.edges:_bent", lambda *_: [])),
+    "edges bend only where they turn little": (("gimp3d.solvers.edges:ROUND", float("inf")),),
+    "an edge counts beside one that is told better": (("gimp3d.solvers.edges:FIRM", 0.0),),
+    "what varies little need not be explained": (("gimp3d.solvers.regularity:LOCALLY", -float("inf")),),
     "an edge is told as far as others, or not": (("gimp3d.solvers.edges:SOON", REACH),),
     "what photos disagree on ends edges": (
         ("gimp3d.solvers.exemplar:find_edges", Around(lambda find: lambda *p: find(*p[:3], p[2]))),

@@ -28,6 +28,7 @@ SOON = 24  # or so many, of one that is told on one side only and not so far: it
 FURTHEST = 120  # px from the hole, where they lie at most
 TELLS = 4.0  # times the noise that a step of mean colours must be on both sides
 HALF_TELLS = 8.0  # where it is told on one side only: among all lines noise alone comes to 7
+FIRM = 0.5  # share of what the best line there tells that both sides must tell it: a streak ends at a plate's rim
 STEEP = 4.0  # grey levels that it must be
 CLUMPED = 4.0  # by which textures' noise exceeds that of independent pixels, squared
 ROWS = np.array([-6, -5, -4, -2, -1, 1, 2, 4, 5, 6])  # px across an edge
@@ -42,7 +43,7 @@ LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge
 MOST = 8  # edges of a part of the hole
 BOTH, BEFORE, AFTER = range(3)  # the sides of the hole on which an edge is told
 TURN = math.radians(30)  # by which an edge turns at least at a corner, and by which less than straight back
-LEAST_BOW = (
+ROUND = (
     0.25  # share of a circle's bend that beside the hole tells it: up to 0.1 is seen at corners, 0.3 to 1 on circles
 )
 BOWS = np.linspace(-0.01, 0.01, 17)  # 1/px, by which an edge may bend
@@ -85,34 +86,42 @@ def _of_part(image: np.ndarray, hole: np.ndarray, known: np.ndarray, sure: np.nd
     open_ = cv2.resize(hole.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
     angles = np.arange(0, 180, ANGLE)
     told = np.array(parallel_map(lambda a: _steps(small, there, open_, a, scale), angles))  # [angles, sides, rows]
-    heart = (told.shape[2] - 1) / 2
-    middle = (np.array(size) - 1) / 2
+    alone = told.copy()
+    told[:, BEFORE:][alone[:, BEFORE:] < HALF_TELLS] = 0
+    axes = np.array([turn_of(-angle) for angle in angles])  # [angles, 2 (along, across), 2]
+    offsets = np.arange(told.shape[2]) - (told.shape[2] - 1) / 2
+    middle, number = (np.array(size) - 1) / 2, np.arange(len(angles))
     places = np.argwhere(open_)[:, ::-1] - middle
+
+    def through(place: np.ndarray, inwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which lines [angles, rows] run into the hole there, and on which side [angles]."""
+        beside = np.abs(offsets - (axes[:, 1] @ place)[:, None]) <= max(1.5, APART * scale)
+        return beside, np.where(axes[:, 0] @ inwards > 0, BEFORE, AFTER)
+
     found: list[Edge | _Half] = []
-    for number in range(2 * MOST):
-        sides = slice(BOTH, BOTH + 1) if number < MOST and told[:, BOTH].any() else slice(BEFORE, AFTER + 1)
+    for tried in range(2 * MOST):
+        sides = slice(BOTH, BOTH + 1) if tried < MOST and told[:, BOTH].any() else slice(BEFORE, AFTER + 1)
         k, side, row = (int(n) for n in np.unravel_index(told[:, sides].argmax(), told[:, sides].shape))
         side += sides.start
         if told[k, side, row] <= 0:
             break
-        along, across = turn_of(-angles[k])
-        offset = row - heart
-        cut = (places @ along)[np.abs(places @ across - offset) <= 1]
+        along, across = axes[k]
+        cut = (places @ along)[np.abs(places @ across - offsets[row]) <= 1]
+        ways = (cut.min(), along), (cut.max(), -along)
+        ends = [through(offsets[row] * across + t * along, way) for t, way in (ways, ways[:1], ways[1:])[side]]
+        tells = alone[k, BEFORE:, max(0, row - 1) : row + 2].max(1)
+        firm = all(own >= FIRM * alone[number, here][beside].max() for own, (beside, here) in zip(tells, ends))
         edges: Sequence[Edge | _Half] = []
-        if cut.max() - cut.min() >= LEAST_CUT * scale:
-            place = ((offset * across + middle) + 0.5) / scale - 0.5
+        if cut.max() - cut.min() >= LEAST_CUT * scale and (side != BOTH or firm):
+            place = ((offsets[row] * across + middle) + 0.5) / scale - 0.5
             settled = partial(_settled, picture, (known, sure), hole, angles[k], place)
             edge = settled(side)
             edges = [edge] if edge is not None else _bent(settled) if side == BOTH else []
         found += edges
-        ways = (cut.min(), along), (cut.max(), -along)
-        for end, inwards in (ways, ways[:1], ways[1:])[side]:
-            place = offset * across + end * along
-            for other, angle in enumerate(angles):
-                axes = turn_of(-angle)
-                beside = np.abs(np.arange(told.shape[2]) - heart - place @ axes[1]) <= max(1.5, APART * scale)
-                here = BEFORE if inwards @ axes[0] > 0 else AFTER
-                told[other, [[BOTH], [here if edges or side != BOTH else BOTH]], beside] = 0
+        for beside, here in ends:
+            told[:, BOTH][beside] = 0
+            if edges or side != BOTH:
+                told[number, here] = np.where(beside, 0, told[number, here])
     whole = [edge for edge in found if isinstance(edge, Edge)]
     halves = _joined([half for half in found if isinstance(half, _Half)], hole)
     return [replace(edge, origin=edge.origin + corner) for edge in [*whole, *halves]]
@@ -188,7 +197,7 @@ def _turning(one: _Half, other: _Half, place: np.ndarray) -> _Meeting | None:
     x, y = np.rint(meeting).astype(int)
     if min(ways) < 0 or not (0 <= y < place.shape[0] and 0 <= x < place.shape[1] and place[y, x]):
         return None
-    bends = (one.bow - other.bow) / 2 / (2 * math.tan(turn / 2) / (sum(ways) + SOON)) >= LEAST_BOW
+    bends = (one.bow - other.bow) / 2 / (2 * math.tan(turn / 2) / (sum(ways) + SOON)) >= ROUND
     edges = [half.until(far) for half, far in zip((one, other), ways)]
     return sum(ways), _curve(one, other, meeting) if bends or abs(turn) < TURN else edges
 
@@ -271,8 +280,7 @@ def _steps(picture: np.ndarray, known: np.ndarray, hole: np.ndarray, angle: floa
         pairs.append(np.stack([np.roll(whole, k, 1) + np.roll(whole, 2 * k, 1) for k in (1, -1)], 1))
     least = 2 * LEAST * scale
     far, soon = (np.array([_told(told[k : k + 1], least) for k in (0, 1)]) for told in pairs)
-    halves = np.where(far >= HALF_TELLS, far, np.where(soon >= HALF_TELLS, soon, 0.0))
-    return np.concatenate([_told(pairs[0], least)[None], halves])
+    return np.concatenate([_told(pairs[0], least)[None], np.where(far >= HALF_TELLS, far, soon)])
 
 
 def _told(sums: np.ndarray, least: float) -> np.ndarray:

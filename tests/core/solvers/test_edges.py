@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from structured import structured
 
 from gimp3d.solvers.edges import find_edges, guide_of
 from gimp3d.solvers.exemplar import complete_picture
@@ -237,3 +238,12 @@ def test_what_is_wrong_next_to_the_hole_does_not_end_an_edge() -> None:
     picture[wrong & (below <= 0)], picture[wrong & (below > 0)] = (190, 150, 255), (60, 50, 20)
     edges = found(picture)
     assert len(off(edges, below)) > 90 and off(edges, below).max() < 4
+
+
+def test_a_boards_streaks_do_not_hide_a_plates_rim() -> None:
+    """They run into the hole beside it and go on behind: but what is told there best is the rim."""
+    picture, hole = structured()["plate"]
+    rim = [edge for edge in found(picture, hole) if np.linalg.norm(edge.step) > 80]
+    ends = np.array([edge.origin + t * edge.along for edge in rim for t in edge.ends])
+    inside = hole[tuple(np.rint(ends).astype(int).clip(0, 199).T[::-1])]
+    assert inside.sum() > 4 and np.abs(np.hypot(ends[:, 1] - 180, ends[:, 0] - 80) - 80)[inside].max() < 2

@@ -35,6 +35,12 @@ def test_arms_of_a_flower_are_turned_into_place() -> None:
     assert np.median(np.abs(filled[regular].astype(float) - truth[regular])) < 4
 
 
+def test_a_boards_grain_is_not_turned_with_a_plates_rim() -> None:
+    truth, hole = PICTURES["plate"]
+    motions = find_motions(np.where(hole[..., None], np.uint8(0), truth), hole, ~hole)
+    assert all(abs(motion.turn[1, 0]) < 0.1 for motion in motions)
+
+
 @pytest.mark.parametrize("angle", [0.0, 33.0])
 def test_what_has_an_axis_is_reflected_at_it(angle: float) -> None:
     half = np.random.default_rng(1).integers(0, 256, (130, 75, 3), dtype=np.uint8)
