@@ -56,7 +56,7 @@ def complete_picture(
 ) -> tuple[np.ndarray, float]:
     """Fill the hole: by motions that explain what is round it, else so that every patch of it resembles one outside.
 
-    Straight edges that the hole cuts are continued: patches on them are copied from patches on edges. What is unknown
+    Edges that the hole cuts are continued: patches on them are copied from patches on edges. What is unknown
     near the hole is filled with it, and thrown away: so it has no say in what the hole is like.
 
     Returns the picture [H, W, 3] uint8, outside the hole bit for bit the input, and its misfit: RMS grey levels between
