@@ -45,7 +45,8 @@ def truncated(gaussians: Gaussians, towards: np.ndarray, share: np.ndarray) -> G
     """What is left of Gaussians, as Gaussians, if a plane cuts a share [M] off each, on the side that is away from
     `towards` [M, 3]: unit vectors along the local axes, in standard deviations.
 
-    Mean and variance across the plane are those of the truncated normal distribution; the opacity keeps the mass.
+    Mean and variance across the plane are those of the truncated normal distribution (Johnson, Kotz and Balakrishnan
+    1994, 10.1); the opacity keeps the mass.
     """
     at = ndtri(share)
     ahead = np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi) / (1 - share)

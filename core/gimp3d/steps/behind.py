@@ -108,19 +108,25 @@ def find_surfaces(
     planes = find_planes(witnesses, region, settings.charts, settled)
     laid = lay_planes(planes, witnesses, region, settings.charts)
     reason = f"{len(planes)} planes run into what the object hid"
-    found = replace(found, planes=planes, laid=laid, reason=reason)
-    low, sunk = over_surfaces(scene, region, laid)
+    return _as_photos_show(replace(found, planes=planes, laid=laid, reason=reason), region, masks, views, settings)
+
+
+def _as_photos_show(
+    found: Surfaces, region: Region, masks: Masks, views: Sequence[ViewState], settings: RemovalSettings
+) -> Surfaces:
+    """The same, but what photos show beside the object stays, what they show as it goes, and what is both is split."""
+    scene, selection = found.scene, found.selection
+    low, sunk = over_surfaces(scene, region, found.laid)
     may = low & scene.usable & near_region(scene, region, 1.0) & ~np.isin(selection.fates, NAMED)
     if not may.any():
         return found
     asked = {camera.id for camera in spread_views([v.camera for v in masks.views], region, CUT)}
-    looks = zip(masks.views, views, marked)
+    looks = zip(masks.views, views, found.marked)
     sights = [Sight(v.camera, s.bare, v.polygon, m) for v, s, m in looks if v.camera.id in asked]
     goes = selection.removed & (selection.fates != Fate.REMOVED_MASKED)
     stays = np.isin(selection.fates, LEFT)
     shown = shown_beside(scene, goes, stays, may, sights)
-    finite = np.isfinite(scene.opacity_logits) & np.isfinite(scene.log_scales).all(1)
-    both = shown.both & scene.usable & finite & (scene.scales.max(1) < LARGEST * extent(region))
+    both = shown.both & _may_change(scene, region) & np.isfinite(scene.log_scales).all(1)
     fates = np.where(shown.object_, np.uint8(Fate.REMOVED_STRADDLING), selection.fates)
     fates[selection.removed & (shown.beside | both)] = Fate.KEPT_SURFACE
     back, gone, split = selection.removed & (fates == Fate.KEPT_SURFACE), int(shown.object_.sum()), np.flatnonzero(both)
@@ -135,10 +141,16 @@ def find_surfaces(
     objects, doubtful = (
         object_pixels(scene, rows, masks.views, settings.clearing) for rows in (selection.removed, wary)
     )
-    reason += f", {int((back & ~both).sum())} Gaussians are shown beside it and stay, {gone} as it and go"
+    reason = f"{found.reason}, {int((back & ~both).sum())} Gaussians are shown beside it and stay, {gone} as it and go"
     reason += f", {len(split)} are both and split"
     found = replace(found, selection=selection, objects=objects, doubtful=doubtful, reason=reason)
     return replace(found, beside=np.append(shown.beside, more), scene=scene, split=split)
+
+
+def _may_change(scene: Gaussians, region: Region) -> np.ndarray:
+    """[N] bool: what may get other values: near the object, small, and of an opacity that has a slope."""
+    fits = near_region(scene, region, 1.0) & (scene.scales.max(1) < LARGEST * extent(region))
+    return scene.usable & fits & np.isfinite(scene.opacity_logits)  # infinite ones are legal
 
 
 @dataclass(frozen=True)
@@ -300,8 +312,7 @@ def relearn(
     """
     kept = scene.take(~removed)
     showing = looked_at([v for v in views if v.masks.silhouette.any()], settings.refine)
-    near = kept.usable & near_region(kept, region, 1.0) & (kept.scales.max(1) < LARGEST * extent(region))
-    near &= np.isfinite(kept.opacity_logits)  # infinite ones are legal, and have no slope
+    near = _may_change(kept, region)
 
     def weights(view: ViewState) -> np.ndarray:
         labels = np.where(view.masks.silhouette, PLACE, ELSEWHERE).astype(np.uint8)
