@@ -185,8 +185,8 @@ def _joined(halves: Sequence[_Half], hole: np.ndarray) -> list[Edge]:
 
 
 def _turning(one: _Half, other: _Half, place: np.ndarray) -> _Meeting | None:
-    """One edge that turns where two lines meet in `place`, [H, W] bool: at a corner, or on a curve if it turns little
-    or bends beside the hole as the circle does that joins them.
+    """One edge that turns where two lines meet in `place`, [H, W] bool: on a curve if it bends beside the hole as the
+    circle does that joins them, or turns so little that this need not show and does not bend back; else at a corner.
     """
     into, out, apart = one.way, -other.way, other.entry - one.entry
     turn = math.atan2(_cross(into, out), into @ out)
@@ -197,9 +197,10 @@ def _turning(one: _Half, other: _Half, place: np.ndarray) -> _Meeting | None:
     x, y = np.rint(meeting).astype(int)
     if min(ways) < 0 or not (0 <= y < place.shape[0] and 0 <= x < place.shape[1] and place[y, x]):
         return None
-    bends = (one.bow - other.bow) / 2 / (2 * math.tan(turn / 2) / (sum(ways) + SOON)) >= ROUND
-    edges = [half.until(far) for half, far in zip((one, other), ways)]
-    return sum(ways), _curve(one, other, meeting) if bends or abs(turn) < TURN else edges
+    bends, little = (one.bow - other.bow) / 2 / (2 * math.tan(turn / 2) / (sum(ways) + SOON)), abs(turn) < TURN
+    if bends >= (-ROUND if little else ROUND):
+        return sum(ways), _curve(one, other, meeting)
+    return None if little else (sum(ways), [half.until(far) for half, far in zip((one, other), ways)])
 
 
 def _curve(one: _Half, other: _Half, meeting: np.ndarray) -> list[Edge]:
