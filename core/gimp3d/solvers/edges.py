@@ -43,7 +43,7 @@ LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge
 MOST = 8  # edges of a part of the hole
 BOTH, BEFORE, AFTER = range(3)  # the sides of the hole on which an edge is told
 TURN = math.radians(30)  # by which an edge turns at least at a corner, and by which less than straight back
-ROUND = 0.25  # share of a circle's bend beside the hole that tells it: corners show up to 0.1, circles 0.25 to 1
+ROUND = 0.25  # share of a circle's bend beside the hole that tells it: corners show hardly any
 BOWS = np.linspace(-0.01, 0.01, 17)  # 1/px, by which an edge may bend
 PIECES = 6  # straight ones of a curve
 
