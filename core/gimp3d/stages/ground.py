@@ -11,15 +11,14 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..geometry import dilated
-from .charts import shown_there, usual_spread
-from .charts.find import flat_surface, lay_surface, pixel_size, surface_beside
+from .charts import scatter_about, shown_there, usual_spread
+from .charts.find import TOLERANCE, flat_surface, lay_surface, pixel_size, surface_beside
 from .charts.plane import Facing, Plane, extent, largest_plane
 from .witness import Says, Textures, Witness, ask, mosaic
 
 REACH = 2.0  # diagonals of the region round the object in which a shadow is looked for
 DENSITY = 48  # texels per diagonal in which lights are settled; they are sought in half as many
 ENOUGH = 64  # points that tell where a few texels lie
-ROUGH = 0.2  # relative z by which drawn depths of rough splats may lie off the ground that they show
 FEWEST = 100  # texels of a surface that is looked at
 BESIDE = 2  # texels beside what the object hides that may show some of it, at least
 BLURRED = 3.0  # pixels of the views that show the place best; so much beside it may show some of the object, too
@@ -65,19 +64,20 @@ def _look_at(plane: Plane, planes: Sequence[Plane], witnesses: Sequence[Witness]
     beside = max(BESIDE, math.ceil(BLURRED * pixel_size(plane.origin, plane.normal, witnesses) / texel))
     witnesses = parallel_map(lambda w: _shrunk(w, plane.origin, texel), witnesses)
     textures = Textures.make(witnesses)
-    surface = lay_surface(flat, region, witnesses, textures, enough=ENOUGH)
+    crossing = tuple(other for other in planes if plane.crosses(other))
+    surface = lay_surface(flat, region, witnesses, textures, enough=ENOUGH, others=crossing)
     points = surface.points()
-    said = ask(witnesses, points.reshape(-1, 3), ROUGH).reshape(-1, *flat.depth.shape)
+    tolerance = max(TOLERANCE, scatter_about(surface, crossing, witnesses))
+    said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *flat.depth.shape)
     image, spread, _ = mosaic(points, plane.normal, witnesses, said)
     photos, hidden = ((said == s).sum(0) for s in (Says.SEEN, Says.HIDDEN))
     there = np.ones(photos.shape, bool)
-    for other in planes:
-        if plane.crosses(other):
-            there &= other.local(points.reshape(-1, 3))[:, 2].reshape(there.shape) > 0
+    for other in crossing:
+        there &= other.local(points.reshape(-1, 3))[:, 2].reshape(there.shape) > 0
     known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = dilated((photos <= 1) & (hidden > 0), beside)
-    return Ground(plane, flat.camera, surface.depth, there, image, known & ~hole, hole)
+    return Ground(plane, flat.camera, surface.depth, there, image, known & ~hole, hole, tolerance)
 
 
 def _shrunk(witness: Witness, place: np.ndarray, texel: float) -> Witness:

@@ -18,7 +18,7 @@ from ..geometry import colours_at
 from ..raster import render
 from ..srgb import decoded, linear
 from .charts.plane import Plane, extent
-from .ground import ROUGH, Ground
+from .ground import Ground
 from .light_search import EARNS, FITS, places_elsewhere
 from .occluder import standing
 from .witness import Says, Witness, ask, spread
@@ -149,7 +149,7 @@ def find_reflection(
     known[::2, ::2] = ground.known[::2, ::2]
     points = ground.points()[known]
     texel = 2 * float(np.median(ground.depth)) / ground.camera.fx
-    seen = ask(used, points, ROUGH) == Says.SEEN
+    seen = ask(used, points, ground.tolerance) == Says.SEEN
     several = seen.sum(0) >= SEVERAL
 
     def fit(gaussians: Gaussians) -> tuple[np.ndarray, float, float]:

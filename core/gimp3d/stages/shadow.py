@@ -25,7 +25,7 @@ from ..solvers.lights import Shading
 from ..srgb import linear
 from .charts import Chart
 from .charts.plane import Plane, extent
-from .ground import FEWEST, ROUGH, Ground
+from .ground import FEWEST, Ground
 from .light_search import BROAD, DARK, FAINT, FINEST, LEVELS, Light, Receiver, Scenery, search, taken_from
 from .occluder import Occluder
 from .witness import Says, Witness, ask
@@ -225,7 +225,7 @@ def _of_marked_lamps(cast: Shadow, shapes: Sequence[np.ndarray]) -> Shadow | Non
 def _marked_on(ground: Ground, masks: Sequence[np.ndarray | None], witnesses: Sequence[Witness]) -> np.ndarray:
     """[H, W, S] float32: where most masks mark a ground, with edges of several softnesses."""
     points = ground.points().reshape(-1, 3)
-    said = ask(witnesses, points, ROUGH)
+    said = ask(witnesses, points, ground.tolerance)
     votes, voters = np.zeros(len(points)), np.zeros(len(points))
     for mask, witness, says in zip(masks, witnesses, said):
         if mask is None:
@@ -256,7 +256,8 @@ def find_contact(charts: Sequence[Chart]) -> Shadow | str:
     share = max(share for _, _, share in rims)
     most = max(float(np.percentile(taken[taken > 0], 90)) for _, taken, _ in rims)
     words = f"a dark rim round {share:.0%} of its outline, where up to {most:.0%} of the light is missing"
-    grounds = tuple(Ground(c.plane, c.camera, c.depth, c.there, c.image, c.known, c.hole) for c, _, _ in rims)
+    shown = ((c.plane, c.camera, c.depth, c.there, c.image, c.known, c.hole, c.tolerance) for c, _, _ in rims)
+    grounds = tuple(Ground(*of) for of in shown)
     return Shadow(grounds, None, (), tuple(taken for _, taken, _ in rims), share, 1 - 1 / CHANCE, words)
 
 

@@ -29,7 +29,6 @@ from .find import (
     Laid,
     depth_scatter,
     flat_surface,
-    grid,
     lay_surface,
     pixel_density,
     pixel_size,
@@ -64,7 +63,6 @@ class Chart(Facing, Laid):
 
     photos: np.ndarray  # uint16, how many show it
     scatter: float  # relative z by which the views' drawn surfaces scatter about it
-    tolerance: float  # the same, but never very small: within it a drawn surface is this one
 
     @property
     def shown(self) -> np.ndarray:
@@ -175,15 +173,12 @@ class _Shown:
 
 def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Chart, np.ndarray]:
     """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
-    points, shape = laid.points(), laid.depth.shape
-    texels = points.reshape(-1, 3)
-    told, scatter = _told(laid), depth_scatter(_before(texels, laid.others), witnesses)
-    if scatter == MOST_SCATTER:  # most of it is another surface
-        scatter = depth_scatter(points[told], witnesses)
+    points, scatter = laid.points(), scatter_about(laid, laid.others, witnesses)
     tolerance = max(TOLERANCE, scatter)
-    shown = _shown(points, laid.plane, witnesses, tolerance, told)
+    shown = _shown(points, laid.plane, witnesses, tolerance, _told(laid))
     colours = _object_colours(laid.plane, witnesses, tolerance)
-    rests, foreign = _told_by_colours(shown, colours, in_region(region, texels).reshape(shape))
+    inside = in_region(region, points.reshape(-1, 3)).reshape(laid.depth.shape)
+    rests, foreign = _told_by_colours(shown, colours, inside)
     hole = shown.hole | rests
     chart = Chart(
         **vars(laid),
@@ -208,15 +203,13 @@ def _placed(
     as a plane's far end, is left out rather than to show the rest with less detail than photos.
     """
     diagonal = extent(region)
-    if drawn:
-        places = places_drawn(plane, 2 * diagonal, PLACES, witnesses, HEIGHT * diagonal)
-        x, y = np.moveaxis(plane.local(places)[..., :2], -1, 0)
-    else:
-        x, y = grid(2 * diagonal, PLACES)
-        places = plane.points(x, y)
+    around = flat_surface(plane, plane.origin, np.full(2, 4 * diagonal), 4 * diagonal / PLACES)
+    places = places_drawn(plane, 2 * diagonal, PLACES, witnesses, HEIGHT * diagonal) if drawn else around.points()
+    x, y = np.moveaxis(plane.local(places)[..., :2], -1, 0)
     places = places.reshape(-1, 3)
     said = ask(witnesses, places, TOLERANCE)
-    hole = _unseen(said.reshape(-1, *x.shape))
+    of_views = said.reshape(-1, *x.shape)
+    hole = _unseen(of_views) & _hanging_together(shown_there(of_views), _told(around))
     labels, _ = scipy.ndimage.label(hole)
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
@@ -255,9 +248,7 @@ def _shown(
     """What photos show at points [H, W, 3] of a surface; it is what hangs together with texels that led to it [H, W]
     bool, and does not begin anew where it goes through another one."""
     said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
-    there = shown_there(said)
-    parts, _ = scipy.ndimage.label(there)
-    there &= np.isin(parts, parts[told])
+    there = _hanging_together(shown_there(said), told)
     hole = _unseen(said) & there
     image, spread, loud = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
@@ -310,20 +301,30 @@ def _object_colours(plane: Plane, witnesses: Sequence[Witness], tolerance: float
     return np.concatenate(parallel_map(of, witnesses))
 
 
-def _before(surface: np.ndarray, others: Sequence[Plane]) -> np.ndarray:
-    """Of points [N, 3] those before the planes that they may meet, or all if these are few.
+def scatter_about(surface: Surface, others: Sequence[Plane], witnesses: Sequence[Witness]) -> float:
+    """Relative z by which the views' drawn surfaces scatter about this one, before the others that it may meet.
 
-    What lies behind, such as a wall, says nothing of how a floor's depths scatter.
+    What lies behind those, such as a wall, says nothing of how a floor's depths scatter; and where most of it is
+    another surface, only the texels that led to it do.
     """
-    before = np.all([other.local(surface)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
-    return surface[before] if before.sum() > TELLING else surface
+    points = surface.points()
+    texels = points.reshape(-1, 3)
+    before = np.all([other.local(texels)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
+    scatter = depth_scatter(texels[before] if before.sum() > TELLING else texels, witnesses)
+    return depth_scatter(points[_told(surface)], witnesses) if scatter == MOST_SCATTER else scatter
 
 
-def _told(laid: Laid) -> np.ndarray:
+def _hanging_together(there: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the parts of a surface that texels which led to it lie on."""
+    parts, _ = scipy.ndimage.label(there)
+    return there & np.isin(parts, parts[told])
+
+
+def _told(surface: Surface) -> np.ndarray:
     """[H, W] bool: texels at the pixels that led to the plane; all if they are few, or not known."""
-    told = np.zeros(laid.depth.shape, bool)
-    if laid.plane.told is not None:
-        _, rows, cols, _ = framed(laid.camera, laid.plane.told[np.isfinite(laid.plane.told).all(1)])
+    told = np.zeros(surface.depth.shape, bool)
+    if surface.plane.told is not None:
+        _, rows, cols, _ = framed(surface.camera, surface.plane.told[np.isfinite(surface.plane.told).all(1)])
         told[rows, cols] = True
     return told if told.sum() > TELLING else np.ones_like(told)
 

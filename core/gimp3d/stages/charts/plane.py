@@ -136,6 +136,7 @@ class Facing(Surface):
     image: np.ndarray  # [H, W, 3] uint8, from photos; 0 where none shows it
     known: np.ndarray  # bool, photos show it, and much the same
     hole: np.ndarray  # bool, the object hides it, or photos may show some of the object there
+    tolerance: float  # relative z within which a surface that views draw is this one
 
 
 @dataclass(frozen=True)
