@@ -2,7 +2,8 @@
 
 The views' depth maps are gathered as points in small cells round the box. Growth starts where the surface leaves the
 cells, well outside the box, and goes on to a neighbouring cell if that lies in the plane of what was reached before it.
-At the crease where an object stands it stops.
+At the crease where an object stands it stops. Things stand on top of a plinth that the box cuts into: near the box's
+faces growth goes over its edge, too, as parts that meet convexly are of one thing (Stein et al. 2014).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.ndimage
@@ -34,6 +36,7 @@ TURN = math.cos(math.radians(50))  # least cosine between both normals
 STEADY = math.cos(math.radians(20))  # from this cosine on its own normal bends the plane that it hands on …
 ADAPT = 0.25  # … with this weight
 SUPPORT = 4  # cells within MARGIN that must have been reached before
+WIDE = 0.5  # of the box, across which a top reaches that something in it stands on
 THICKNESS = 0.5  # cells off its plane up to which a point belongs to the surface
 SLANTED = 0.3  # a floor's size in a picture, over that of a surface that faces the camera
 MARGIN = 2  # empty cells round the grid, so that none looks beyond it: SUPPORT's reach
@@ -80,16 +83,20 @@ def follow_surface(
     dims = tuple(int(n) + 2 * MARGIN for n in np.ceil(2 * half / cell))
 
     def points_in(view: tuple[Camera, np.ndarray]) -> np.ndarray:
-        """The view's points in the grid, [N, 3] in the box's axes; of large pictures no more than two per cell."""
+        """The view's points in the grid, [N, 6] in the box's axes, and unit vectors from them towards the camera; of
+        large pictures no more than two per cell."""
         camera, depth = view
         distance = max(float(camera.to_camera(box.center)[2]), 1e-9)
         step = max(1, int(0.5 * cell * camera.fx / distance))
         _, _, points = surface_points(camera, depth, box_window(replace(box, size=2 * half), camera), step)
         local = (points - box.center) @ box.axes
-        return local[(np.abs(local) < half).all(1)]
+        local = local[(np.abs(local) < half).all(1)]
+        towards = (camera.centre - box.center) @ box.axes - local
+        return np.concatenate([local, towards / np.linalg.norm(towards, axis=1, keepdims=True)], axis=1)
 
     count = min(len(views), VIEWS[coarse])
-    local = np.concatenate(parallel_map(points_in, [views[k * len(views) // count] for k in range(count)]))
+    gathered = np.concatenate(parallel_map(points_in, [views[k * len(views) // count] for k in range(count)]))
+    local, towards = gathered[:, :3], gathered[:, 3:]
     keys = np.ravel_multi_index(tuple(np.floor((local + half) / cell).astype(np.int64).T + MARGIN), dims)
     filled = np.bincount(keys, minlength=math.prod(dims)) > 0
     numbers = np.where(filled, np.cumsum(filled, dtype=np.int32) - np.int32(1), np.int32(-1))  # of cells with points
@@ -100,18 +107,43 @@ def follow_surface(
     cells = np.flatnonzero(filled)[enough]
     points = moments[enough, 1:4] / moments[enough, :1]
     normals = _normals(moments, numbers, cells, _steps(dims, 1))
+    seen_from = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in towards.T], axis=1)[enough]
+    normals *= np.where((normals * seen_from).sum(1) < 0, -1.0, 1.0)[:, None]  # outwards
     numbers = np.full(len(numbers), -1, np.int32)
     numbers[cells] = np.arange(len(points))
     edge = (np.abs(points) > half - SEEDS[coarse] * box.size).any(1)
-    reached = edge & ~in_region(region, box.center + points @ box.axes.T)
-    planes = np.concatenate([points, normals], axis=1)
-    _grow(numbers, cells, _steps(dims, 1), _steps(dims, MARGIN), points, normals, STEP * cell, reached, planes)
+    beside = ~in_region(region, box.center + points @ box.axes.T)
+    reached, planes = edge & beside, np.concatenate([points, normals], axis=1)
+    grow = partial(_grow, numbers, cells, _steps(dims, 1), _steps(dims, MARGIN), points, normals, STEP * cell)
+    grow(np.zeros_like(beside), reached, planes)
+    over = reached.copy()
+    grow(beside, over, planes)
+    reached |= _tops(over & ~reached, cells, dims, points, box, SEEDS[coarse])
     numbers[cells] = np.where(reached, np.cumsum(reached) - 1, -1)
     inner = slice(MARGIN, -MARGIN)
     nearest = numbers.reshape(dims)[inner, inner, inner]
     far, (i, j, k) = scipy.ndimage.distance_transform_edt(nearest < 0, return_indices=True)
     nearest = np.where(far <= 2, nearest[i, j, k], -1).astype(np.int32)
     return FollowedSurface(box, half, cell, nearest, planes[reached, :3], planes[reached, 3:])
+
+
+def _tops(
+    over: np.ndarray, cells: np.ndarray, dims: tuple[int, ...], points: np.ndarray, box: Box, deep: float
+) -> np.ndarray:
+    """[M] bool: of the cells `over` edges those parts that may be the top of what stands in the box: they lie at one of
+    its faces, no deeper than boxes cut into floors, and reach across most of it."""
+    grid = np.zeros(math.prod(dims), bool)
+    grid[cells[over]] = True
+    parts = scipy.ndimage.label(grid.reshape(dims), np.ones((3, 3, 3)))[0].ravel()[cells]
+    within = over & (np.abs(points) < box.size / 2).all(1)
+    found = []
+    for part in np.unique(parts[within]):
+        places = points[within & (parts == part)] / box.size
+        low, high = places.min(0), places.max(0)
+        at_face = np.minimum(high + 0.5, 0.5 - low) < deep
+        if at_face.any() and np.sort(high - low)[1] > WIDE:
+            found.append(part)
+    return over & np.isin(parts, found)
 
 
 def _steps(dims: tuple[int, ...], reach: int) -> np.ndarray:
@@ -154,11 +186,12 @@ def _add_neighbours(cells, numbers, steps, moments, total):
 
 
 @exact_kernel
-def _grow(numbers, cells, near, around, points, normals, most_off, reached, planes):
+def _grow(numbers, cells, near, around, points, normals, most_off, may_turn, reached, planes):
     """Reach cells that continue the plane of those reached before, in rounds; `reached` and `planes` are updated.
 
     A cell hands on the plane that it was reached by, hardly bent by its own normal: at the foot of an object cells
-    hold both surfaces, and their normals would lead growth up its side.
+    hold both surfaces, and their normals would lead growth up its side. Over an edge, where each of both lies behind
+    the other's plane, it hands on its own.
     """
     touched = np.zeros(len(cells), np.bool_)
     front = np.flatnonzero(reached)
@@ -197,5 +230,7 @@ def _grow(numbers, cells, near, around, points, normals, most_off, reached, plan
                 nx, ny, nz = nx + gain * n[0], ny + gain * n[1], nz + gain * n[2]
                 length = math.sqrt(nx * nx + ny * ny + nz * nz)
                 planes[row, 3], planes[row, 4], planes[row, 5] = nx / length, ny / length, nz / length
+            elif may_turn[row] and off < 0:
+                accepted[w] = n[0] * (px - p[0]) + n[1] * (py - p[1]) + n[2] * (pz - p[2]) < 0
         front = waiting[accepted]
         reached[front] = True
