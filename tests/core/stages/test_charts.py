@@ -16,6 +16,7 @@ from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages import charts as stage
 from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
+from gimp3d.stages.ground import look_at as look_round
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
 FLOOR = (np.array([0.0, 0, 1]), 0.0)  # normal, offset
@@ -247,6 +248,12 @@ ACROSS = (
 )  # meets FLOOR at y −0.3, WALL at z 0.5
 
 
+def at_wall() -> np.ndarray:
+    """[N, 3] pixels at the wall that led to such a plane."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 60), np.linspace(0.36, 0.4, 9)))
+    return np.stack([x, y, (y + 0.3) / 1.4], -1)
+
+
 def crossing(told: np.ndarray | None) -> tuple[Plane, tuple[Plane, ...], Room]:
     """A plane that rough depths make up across a corner, the floor and the wall there, and views of them."""
     normal, offset = ACROSS
@@ -267,16 +274,36 @@ def test_a_relief_is_of_what_lies_on_no_other_plane() -> None:
     assert away[0] > 0.1 * extent(REGION) and away[1] < 0.03 * extent(REGION)
 
 
-def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> None:
-    """Pixels at the wall led to the plane: how far depths scatter is asked there, and it ends before the floor."""
-    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 60), np.linspace(0.36, 0.4, 9)))
-    at_wall = np.stack([x, y, (y + 0.3) / 1.4], -1)
-    there, tolerance = {}, {}
-    for told in (None, at_wall):
+def test_what_the_object_hides_of_a_plane_hangs_together_with_what_led_to_it() -> None:
+    places = {}
+    for told in (None, at_wall()):
         plane, _, seen = crossing(told)
         flat = stage._placed(plane, REGION, seen.witnesses, 200)
         assert flat is not None
-        laid = find.Laid(flat.plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
+        places[told is None] = flat.points().reshape(-1, 3)
+    assert places[True][:, 2].min() < -0.1 < 0 < places[False][:, 2].min()  # where it goes through the floor
+
+
+def test_a_ground_of_a_plane_is_what_led_to_it_and_no_other_plane() -> None:
+    """Light and shadow are told on it: what a floor shows once more, elsewhere, is dark in other places."""
+    plane, others, seen = crossing(at_wall())
+    grounds = look_round([plane, *others], seen.witnesses, REGION)
+    shown = {id(g.plane): g.points()[g.known] for g in grounds}
+    floor, wall = (shown[id(other)] for other in others)
+    assert np.abs(floor[:, 2]).max() < 0.01 and np.abs(wall[:, 1] - 0.4).max() < 0.01
+    made_up = shown.get(id(plane), np.zeros((0, 3)))
+    assert len(made_up) < 0.25 * len(floor)
+    assert (np.abs(made_up[:, 1] - 0.4) < np.abs(made_up[:, 2])).all()  # nothing of it is floor
+
+
+def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> None:
+    """Pixels at the wall led to the plane: how far depths scatter is asked there, and it ends before the floor."""
+    there, tolerance = {}, {}
+    for told in (None, at_wall()):
+        plane, _, seen = crossing(told)
+        flat = stage._placed(replace(plane, told=None), REGION, seen.witnesses, 200)
+        assert flat is not None
+        laid = find.Laid(plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
         chart, _ = stage._chart(laid, REGION, seen.witnesses)
         points = texels(chart).reshape(*chart.depth.shape, 3)
         on_floor = np.abs(points[..., 2]) < 0.01

@@ -106,6 +106,37 @@ def test_an_object_that_reaches_beyond_the_box_is_not_its_surroundings() -> None
     assert len(points) > 500 and np.isinf(found.distance(points)).mean() > 0.99
 
 
+def statue(p: np.ndarray) -> np.ndarray:
+    return (np.abs(p - [0, 0, 0.4]) - [0.12, 0.12, 0.4]).max(1)
+
+
+def plinth(p: np.ndarray) -> np.ndarray:
+    """A block 0.7 wide, its top at z = 0, on a floor 0.8 below."""
+    block = (np.abs(p - [0, 0, -0.4]) - [0.35, 0.35, 0.4]).max(1)
+    return np.minimum(block, p[:, 2] + 0.8)
+
+
+@cache
+def views_of_plinth() -> list[tuple[Camera, np.ndarray]]:
+    cameras = orbit_cameras((Box.make([0, 0, 0.4], [0.7, 0.7, 0.9]),), 16, (0, 0, 1), 320, 240, 50)
+    return [(c, march(c, lambda p: np.minimum(plinth(p), statue(p)))) for c in cameras]
+
+
+@pytest.mark.parametrize("width", [0.5, 0.66, 0.8])  # 0.8: all of the top lies in the box
+@pytest.mark.parametrize("deep", [0.01, 0.03])
+def test_a_plinth_s_top_is_followed_over_its_edge_but_not_what_stands_on_it(width: float, deep: float) -> None:
+    box = Box.make([0, 0, 0.41 - deep / 2], [width, width, 0.82 + deep])
+    views = views_of_plinth()
+    found = follow_surface(box, (box,), views)
+    points = points_of(views, box)
+    off = found.distance(points) / found.cell
+    top = (np.abs(points[:, 2]) < 0.004) & (statue(points) > 2 * found.cell)
+    object_ = (statue(points) < 0.004) & (points[:, 2] > 2 * found.cell)
+    assert top.sum() > 300 and object_.sum() > 300
+    assert (off[object_] < THICKNESS).mean() < 0.02
+    assert (off[top] < THICKNESS).mean() > 0.9, (off[top] < THICKNESS).mean()
+
+
 def test_growth_does_not_start_in_another_box_of_the_region() -> None:
     halves = (Box.make([-0.2, 0, 0.26], [0.5, 0.9, 0.66]), Box.make([0.2, 0, 0.26], [0.5, 0.9, 0.66]))
     views = views_of(ground, cube)
