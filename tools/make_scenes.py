@@ -297,7 +297,77 @@ def dome() -> Made:
     return Made([cube], region, (0.05, 0, 0.15), 2.0, (20, 60), (-180, 140))
 
 
-SCENES: dict[str, Callable[[], Made]] = {f.__name__: f for f in (shelf, brick, stairs, edge, rug, cabinet, tiles, dome)}
+def statue() -> Made:
+    """A statue on a plinth whose top is hardly larger than the box."""
+    lit(1.0, 1.5)
+    solid("cube", (0, 0, -0.05), (9, 9, 0.1), paint("Brick", 2.0, "#a89c86", "#b8ac98", "#7c7466"))
+    solid("cylinder", (0, 0, 0.25), (0.9, 0.9, 0.5), paint("Noise", 12.0, "#8d8d88", "#b8b6ae", "#6f6f6c"))
+    for k in range(7):
+        at = (2.6 * math.cos(0.9 * k + 0.4), 2.6 * math.sin(0.9 * k + 0.4), 0.5)
+        solid("uv_sphere", at, (0.9, 0.9, 1.0), paint("Noise", 9.0, "#27401f", "#4f7a35"))
+    bronze = paint("Noise", 5.0, "#5a4a2c", "#8a7440", rough=0.3)
+    parts = [
+        solid("cone", (0, 0, 0.86), (0.5, 0.5, 0.72), bronze),
+        solid("uv_sphere", (0, 0, 1.2), (0.28, 0.28, 0.34), bronze),
+        solid("cube", (0.2, 0, 0.95), (0.5, 0.08, 0.08), bronze, turn=0.6),
+    ]
+    return Made(parts, Box.make([0.05, 0, 0.95], [0.9, 0.7, 0.92]), (0, 0, 0.6), 3.2, (12, 45), (-180, 140))
+
+
+def blanket() -> Made:
+    """A basket on the corner of a checked blanket, which lies 1 cm above grass."""
+    lit(1.0, 1.5)
+    solid("cube", (0, 0, -0.05), (8, 8, 0.1), paint("Noise", 40.0, "#33511f", "#5b7d33", "#88a050"))
+    solid("cube", (0.35, 0.3, 0.004), (1.4, 1.0, 0.012), paint("Checker", 14.0, "#b03038", "#efe9dc"), turn=0.35)
+    wicker = paint("Wave", 25.0, "#7a5230", "#b58a54", stretch=(1, 1, 3))
+    parts = [
+        solid("cube", (-0.12, -0.12, 0.13), (0.42, 0.3, 0.22), wicker, turn=0.2),
+        solid("cylinder", (-0.12, -0.12, 0.3), (0.05, 0.05, 0.16), wicker),
+    ]
+    region = Box.make([-0.12, -0.12, 0.185], [0.56, 0.46, 0.42])
+    return Made(parts, region, (-0.1, -0.1, 0.1), 2.0, (22, 58), (-180, 140))
+
+
+def kerb() -> Made:
+    """A van at a kerb, in hard sun: its shadow falls over the kerb and across two levels."""
+    lit(0.6, 3.0, 1.5)
+    solid("cube", (0, -1.5, -0.05), (8, 3, 0.1), paint("Noise", 30.0, "#3c3d40", "#55565a"))
+    solid("cube", (0, 1.5, 0.03), (8, 3, 0.1), paint("Brick", 3.0, "#8f8a82", "#a29c92", "#6a665f"))
+    solid("cube", (0, 0.06, 0.045), (8, 0.14, 0.13), paint("plain", 1.0, "#b9b5ac"))
+    solid("cube", (0, -0.9, 0.001), (8, 0.12, 0.004), paint("plain", 1.0, "#e8e4d8"))
+    rubber = paint("plain", 1.0, "#202124", rough=0.6)
+    parts = [
+        solid("cube", (0, -0.55, 0.28), (0.9, 0.5, 0.26), paint("plain", 1.0, "#d8a020", rough=0.3)),
+        solid("cube", (0, -0.55, 0.5), (0.5, 0.44, 0.22), paint("plain", 1.0, "#2c3a46", rough=0.2)),
+    ]
+    wheels = [(x, y, 0.1) for x in (-0.28, 0.28) for y in (-0.78, -0.32)]
+    parts += [solid("cylinder", at, (0.2, 0.2, 0.08), rubber, tilt=math.pi / 2) for at in wheels]
+    region = Box.make([0, -0.55, 0.3], [1.0, 0.64, 0.64])
+    return Made(parts, region, (0, -0.5, 0.15), 3.0, (18, 52), (-180, 140), casts=True)
+
+
+def crowd() -> Made:
+    """A shaker among six things that nearly touch it."""
+    lit(1.0, 1.2)
+    solid("cube", (0, 0, -0.03), (2.2, 1.4, 0.06), wood("#d0b890", "#a88a60"))
+    solid("cube", (0, 0, -0.9), (8, 8, 0.1), paint("Checker", 2.0, "#777777", "#999999"))
+    rng = np.random.default_rng(5)
+    colours = "#b03a48", "#2f4f6f", "#d8c08a", "#4a7a54", "#7a4a7d", "#c97f3a"
+    for k, (angle, colour) in enumerate(zip(np.linspace(0, 2 * math.pi, 7), colours)):
+        high = rng.uniform(0.12, 0.3)
+        at = (0.26 * math.cos(angle), 0.26 * math.sin(angle), high / 2)
+        shape = ("cylinder", "cube", "cone")[k % 3]
+        solid(shape, at, (0.16, 0.16, high), paint("Voronoi", 14.0, colour, "#efe9dc"), turn=angle)
+    parts = [
+        solid("cylinder", (0, 0, 0.14), (0.16, 0.16, 0.28), paint("Wave", 20.0, "#e0d8c8", "#303840")),
+        solid("uv_sphere", (0, 0, 0.31), (0.14, 0.14, 0.12), paint("plain", 1.0, "#c03030", rough=0.3)),
+    ]
+    return Made(parts, Box.make([0, 0, 0.185], [0.22, 0.22, 0.41]), (0, 0, 0.12), 1.7, (20, 55), (-180, 140))
+
+
+SCENES: dict[str, Callable[[], Made]] = {
+    f.__name__: f for f in (shelf, brick, stairs, edge, rug, cabinet, tiles, dome, statue, blanket, kerb, crowd)
+}
 
 # ----------------------------------------------------------------------------------------------------------- rendering
 

@@ -101,20 +101,20 @@ def follow_surface(
     filled = np.bincount(keys, minlength=math.prod(dims)) > 0
     numbers = np.where(filled, np.cumsum(filled, dtype=np.int32) - np.int32(1), np.int32(-1))  # of cells with points
     x, rows = local.T, numbers[keys]
-    values = [None, *x, *(x[a] * x[b] for a, b in PAIRS)]
-    moments = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in values], axis=1)
+    values = [None, *x, *(x[a] * x[b] for a, b in PAIRS), *towards.T]
+    sums = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in values], axis=1)
+    moments, seen_from = np.ascontiguousarray(sums[:, :-3]), sums[:, -3:]
     enough = moments[:, 0] >= LEAST_POINTS
     cells = np.flatnonzero(filled)[enough]
     points = moments[enough, 1:4] / moments[enough, :1]
     normals = _normals(moments, numbers, cells, _steps(dims, 1))
-    seen_from = np.stack([np.bincount(rows, v, np.count_nonzero(filled)) for v in towards.T], axis=1)[enough]
-    normals *= np.where((normals * seen_from).sum(1) < 0, -1.0, 1.0)[:, None]  # outwards
+    normals *= np.where((normals * seen_from[enough]).sum(1) < 0, -1.0, 1.0)[:, None]  # outwards
     numbers = np.full(len(numbers), -1, np.int32)
     numbers[cells] = np.arange(len(points))
-    edge = (np.abs(points) > half - SEEDS[coarse] * box.size).any(1)
     places, deep = box.center + points @ box.axes.T, SEEDS[coarse]
+    reached = (np.abs(points) > half - deep * box.size).any(1) & ~in_region(region, places)
     at_faces = ~in_region([replace(b, size=(1 - 2 * deep) * b.size) for b in region], places)
-    reached, planes = edge & ~in_region(region, places), np.concatenate([points, normals], axis=1)
+    planes = np.concatenate([points, normals], axis=1)
     grow = partial(_grow, numbers, cells, _steps(dims, 1), _steps(dims, MARGIN), points, normals, STEP * cell)
     grow(np.zeros_like(at_faces), reached, planes)
     over = reached.copy()

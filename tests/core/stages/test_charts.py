@@ -498,7 +498,7 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     plane = Plane(offset * normal, axes[0], axes[1], normal)
     there = np.ones((h, w), bool)
     laid, shown = (plane, camera, depth, "plane", 1.0, 0.0, (), ""), (there, grey, no, no)
-    return Chart(*laid, *shown, no.astype(np.uint16), scatter=0.0, tolerance=0.01)
+    return Chart(*laid, *shown, 0.01, no.astype(np.uint16), scatter=0.0)
 
 
 def rays_of(camera: Camera) -> np.ndarray:

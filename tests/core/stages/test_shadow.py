@@ -275,7 +275,7 @@ def chart_of(
     depth, there = np.full(hole.shape, 5, np.float32), np.ones_like(hole)
     return Chart(
         plane, camera, depth, "plane", 1.0, 0.0, (), "",
-        there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole, photos, 0.0, 0.01,
+        there, np.where(hole[..., None], np.uint8(0), image), ~hole, hole, 0.01, photos, 0.0,
     )  # fmt: skip
 
 
