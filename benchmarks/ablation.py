@@ -25,7 +25,8 @@ from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.edges import REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
-from gimp3d.stages.charts import grid
+from gimp3d.stages.charts import Plane, Surface
+from gimp3d.stages.charts.find import MOST_SCATTER, flat_surface
 from gimp3d.stages.witness import Says
 
 from .command import kept, parser_of, say, told_in_one_line, write
@@ -53,6 +54,14 @@ def _none_both(shown: Shown) -> Shown:
     return shown._replace(both=np.zeros_like(shown.both))
 
 
+def _placed_anywhere(placed: Callable[..., Surface | None]) -> Callable[..., Surface | None]:
+    def by(plane: Plane, *given: Any, **named: Any) -> Surface | None:
+        found = placed(replace(plane, told=None), *given, **named)
+        return found and replace(found, plane=plane)
+
+    return by
+
+
 ALL_ZERO = Around(lambda rates: dict.fromkeys(rates, 0.0))
 BY_PLACE_ALONE = Around(lambda besides: lambda surface, bent: besides(surface, bent)[:, : 5 if bent else 2])
 RULES: dict[str, tuple[Switch, ...]] = {
@@ -60,6 +69,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "no further references": (("extra_references", 0),),
     "no charts: targets and references as the paper's": (("masks.mode", "paper"), ("charts", None)),
     "what has its centre in the box is the object": (("masks.selection.by_centre", True),),
+    "an edge beside the box ends what is round it": (
+        ("gimp3d.stages.surroundings:_tops", lambda over, *_: np.zeros_like(over)),
+    ),
     "smears that only the removal reveals stay": (("masks.selection.support", 0.0),),
     "planes are settled all round the object": (
         ("gimp3d.stages.charts.find:OWN", 10**9),
@@ -96,8 +108,12 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "what the object hides lies on planes": (
-        ("gimp3d.stages.charts:places_drawn", lambda plane, half, count, *_: plane.points(*grid(half, count))),
+        (
+            "gimp3d.stages.charts:places_drawn",
+            lambda plane, half, n, *_: flat_surface(plane, plane.origin, np.full(2, 2 * half), 2 * half / n).points(),
+        ),
     ),
+    "what is hidden of a plane lies anywhere on it": (("gimp3d.stages.charts:_placed", Around(_placed_anywhere)),),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
     "what lies on other planes tells of a relief, too": (
         ("gimp3d.stages.charts.find:_drawn_surface", Around(lambda drawn: lambda *p: drawn(*p[:4]))),
@@ -188,6 +204,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.light_search:_open_sky", Around(lambda sky: lambda _: sky(np.zeros((0, 3))))),
     ),
     "no walls beside it": (("gimp3d.stages.ground:_walls", lambda *_: []),),
+    "grounds climb other planes": (
+        ("gimp3d.stages.ground:lay_surface", Around(lambda lay: lambda *p, others, **k: lay(*p, **k))),
+    ),
+    "drawn depths lie as far off grounds as can be": (("gimp3d.stages.ground:scatter_about", lambda *_: MOST_SCATTER),),
 }
 
 

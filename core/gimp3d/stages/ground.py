@@ -11,7 +11,7 @@ import numpy as np
 from ..box import Region
 from ..compute.threads import parallel_map
 from ..geometry import dilated
-from .charts import hanging_together, scatter_about, shown_there, told_by, usual_spread
+from .charts import scatter_about, shown_there, usual_spread
 from .charts.find import TOLERANCE, flat_surface, lay_surface, pixel_size, surface_beside
 from .charts.plane import Facing, Plane, extent, largest_plane
 from .witness import Says, Textures, Witness, ask, mosaic
@@ -74,7 +74,7 @@ def _look_at(plane: Plane, planes: Sequence[Plane], witnesses: Sequence[Witness]
     there = np.ones(photos.shape, bool)
     for other in crossing:
         there &= other.local(points.reshape(-1, 3))[:, 2].reshape(there.shape) > 0
-    known = hanging_together(shown_there(said), told_by(surface)) & (photos > 1) & there
+    known = shown_there(said) & (photos > 1) & there
     known &= spread < VIEWED * usual_spread(spread[known])
     hole = dilated((photos <= 1) & (hidden > 0), beside)
     return Ground(plane, flat.camera, surface.depth, there, image, known & ~hole, hole, tolerance)

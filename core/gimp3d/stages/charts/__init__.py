@@ -175,7 +175,7 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Ch
     """The chart, and by how much photos' textures differ, [H, W]; NaN where fewer than two show it."""
     points, scatter = laid.points(), scatter_about(laid, laid.others, witnesses)
     tolerance = max(TOLERANCE, scatter)
-    shown = _shown(points, laid.plane, witnesses, tolerance, told_by(laid))
+    shown = _shown(points, laid.plane, witnesses, tolerance, _told(laid))
     colours = _object_colours(laid.plane, witnesses, tolerance)
     inside = in_region(region, points.reshape(-1, 3)).reshape(laid.depth.shape)
     rests, foreign = _told_by_colours(shown, colours, inside)
@@ -209,7 +209,7 @@ def _placed(
     places = places.reshape(-1, 3)
     said = ask(witnesses, places, TOLERANCE)
     of_views = said.reshape(-1, *x.shape)
-    hole = _unseen(of_views) & hanging_together(shown_there(of_views), told_by(around))
+    hole = _unseen(of_views) & _hanging_together(shown_there(of_views), _told(around))
     labels, _ = scipy.ndimage.label(hole)
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
@@ -248,7 +248,7 @@ def _shown(
     """What photos show at points [H, W, 3] of a surface; it is what hangs together with texels that led to it [H, W]
     bool, and does not begin anew where it goes through another one."""
     said = ask(witnesses, points.reshape(-1, 3), tolerance).reshape(-1, *points.shape[:2])
-    there = hanging_together(shown_there(said), told)
+    there = _hanging_together(shown_there(said), told)
     hole = _unseen(said) & there
     image, spread, loud = mosaic(points, plane.normal, witnesses, said)
     photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
@@ -311,16 +311,16 @@ def scatter_about(surface: Surface, others: Sequence[Plane], witnesses: Sequence
     texels = points.reshape(-1, 3)
     before = np.all([other.local(texels)[:, 2] > 0 for other in others], axis=0) if others else np.ones(1, bool)
     scatter = depth_scatter(texels[before] if before.sum() > TELLING else texels, witnesses)
-    return depth_scatter(points[told_by(surface)], witnesses) if scatter == MOST_SCATTER else scatter
+    return depth_scatter(points[_told(surface)], witnesses) if scatter == MOST_SCATTER else scatter
 
 
-def hanging_together(there: np.ndarray, told: np.ndarray) -> np.ndarray:
+def _hanging_together(there: np.ndarray, told: np.ndarray) -> np.ndarray:
     """[H, W] bool: the parts of a surface that texels which led to it lie on."""
     parts, _ = scipy.ndimage.label(there)
     return there & np.isin(parts, parts[told])
 
 
-def told_by(surface: Surface) -> np.ndarray:
+def _told(surface: Surface) -> np.ndarray:
     """[H, W] bool: texels at the pixels that led to the plane; all if they are few, or not known."""
     told = np.zeros(surface.depth.shape, bool)
     if surface.plane.told is not None:
