@@ -27,7 +27,7 @@ from .look import box_window
 CELLS = 800_000, 200_000  # of the grid round one box at most: more take seconds and hold too few points each
 VIEWS = 60, 20  # at most so many, spread evenly, are gathered: further ones show the same surface
 BEYOND = 0.25, 0.1  # how far the grid reaches beyond each face of the box, as a share of its size across
-SEEDS = 0.1, 0.05  # width of the grid's outer layer, where growth starts, as such a share
+SEEDS = 0.1, 0.05  # width of the grid's outer layer, where growth starts, as such a share; boxes cut in no deeper
 LEAST_CELL = 1.5  # edge of a cell, pixels of a usual view: narrower ones stay empty between pixels
 LEAST_POINTS = 3  # in a cell that counts as surface: as many as span a plane
 # Of a cell against the plane of those reached before it; test_surroundings holds them against shapes that are known.
@@ -129,7 +129,12 @@ def follow_surface(
 
 
 def _tops(
-    over: np.ndarray, cells: np.ndarray, dims: tuple[int, ...], points: np.ndarray, box: Box, deep: float
+    over: np.ndarray,  # [M] bool
+    cells: np.ndarray,  # [M], see _normals
+    dims: tuple[int, ...],  # of the grid
+    points: np.ndarray,  # [M, 3]
+    box: Box,
+    deep: float,  # share of its size
 ) -> np.ndarray:
     """[M] bool: of the cells `over` edges those parts that may be the top of what stands in the box: they lie at one of
     its faces, no deeper than boxes cut into floors, and reach across most of it."""

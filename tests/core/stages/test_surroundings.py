@@ -15,7 +15,7 @@ from gimp3d.box import Box
 from gimp3d.camera import Camera
 from gimp3d.gaussians import quats_to_matrices
 from gimp3d.orbit import orbit_cameras
-from gimp3d.stages.surroundings import THICKNESS, follow_surface
+from gimp3d.stages.surroundings import THICKNESS, _tops, follow_surface
 
 Height = Callable[[np.ndarray], np.ndarray]  # signed height of points [N, 3] above the surface, about in scene units
 CUBE = 0.5
@@ -134,7 +134,24 @@ def test_a_plinth_s_top_is_followed_over_its_edge_but_not_what_stands_on_it(widt
     object_ = (statue(points) < 0.004) & (points[:, 2] > 2 * found.cell)
     assert top.sum() > 300 and object_.sum() > 300
     assert (off[object_] < THICKNESS).mean() < 0.02
-    assert (off[top] < THICKNESS).mean() > 0.9, (off[top] < THICKNESS).mean()
+    assert (off[top] < THICKNESS).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "wide, height, kept",
+    [(0.8, -0.48, True), (0.8, 0.48, True), (0.3, -0.48, False), (0.8, -0.2, False), (0.8, 0.0, False)],
+)
+def test_over_edges_only_what_spans_a_face_of_the_box_is_a_top(wide: float, height: float, kept: bool) -> None:
+    """Not a facet of the object that the box cut off, however it was reached, nor what lies deeper."""
+    box, cell = Box.make([0, 0, 0], [1, 1, 1]), 0.02
+    side = np.arange(-wide / 2, wide / 2, cell)
+    x, y = (a.ravel() for a in np.meshgrid(side, side))
+    points = np.stack([x, y, np.full(len(x), height)], 1)
+    dims = (50, 50, 50)
+    cells = np.ravel_multi_index(tuple(np.floor((points + 0.5) / cell + 1e-6).astype(int).T), dims)
+    order = np.argsort(cells)
+    over = np.ones(len(cells), bool)
+    assert (_tops(over, cells[order], dims, points[order], box, 0.05) == kept).all()
 
 
 def test_growth_does_not_start_in_another_box_of_the_region() -> None:
