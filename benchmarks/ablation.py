@@ -25,7 +25,7 @@ from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.edges import REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
-from gimp3d.stages.charts import Plane, Surface
+from gimp3d.stages.charts import Plane, Surface, find
 from gimp3d.stages.charts.find import MOST_SCATTER, flat_surface
 from gimp3d.stages.witness import Says
 
@@ -48,6 +48,11 @@ class Around:
 
 def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
     return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
+
+
+def _scatter_of_all(points: np.ndarray, witnesses: Any) -> float:
+    off = np.abs(find._depths_off(points, witnesses))
+    return min(MOST_SCATTER, find.SCATTER * float(np.median(off))) if len(off) else 0.0
 
 
 def _none_both(shown: Shown) -> Shown:
@@ -112,6 +117,19 @@ RULES: dict[str, tuple[Switch, ...]] = {
             "gimp3d.stages.charts:places_drawn",
             lambda plane, half, n, *_: flat_surface(plane, plane.origin, np.full(2, 2 * half), 2 * half / n).points(),
         ),
+    ),
+    "photos count that show what stands before a surface": (
+        (
+            "gimp3d.stages.charts.find:_free",
+            lambda points, textures: np.ones((len(points), len(textures.cameras)), bool),
+        ),
+    ),
+    "planes are sought at any distance": (("gimp3d.stages.charts.find:_sought", lambda _: True),),
+    "what stands before a surface tells how it scatters": tuple(
+        (f"gimp3d.stages.{module}:depth_scatter", _scatter_of_all) for module in ("charts", "charts.find")
+    ),
+    "the object hides what other things stand before": (
+        ("gimp3d.stages.charts:_hides_from_most", lambda hiding, photos, _: hiding > photos),
     ),
     "what is hidden of a plane lies anywhere on it": (("gimp3d.stages.charts:_placed", Around(_placed_anywhere)),),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),

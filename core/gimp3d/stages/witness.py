@@ -132,6 +132,7 @@ def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
 class Textures:
     """Photos reduced to their texture, for comparing; see agreement."""
 
+    witnesses: Sequence[Witness]  # [V], those that are compared
     cameras: np.ndarray  # [V, 18]
     starts: np.ndarray  # [V] int64, a view's first pixel
     values: np.ndarray  # int8, band-passed luminance of all views; −128 where it is hidden
@@ -151,24 +152,27 @@ class Textures:
             camera[16:] = w, h
             return camera, np.where(hidden, np.int8(-128), texture(photo, ~hidden)).ravel()
 
-        cameras, values = zip(*parallel_map(of, spread(witnesses, most)))
+        witnesses = spread(witnesses, most)
+        cameras, values = zip(*parallel_map(of, witnesses))
         sizes = np.array([len(v) for v in values], np.int64)
-        return cls(np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
+        return cls(witnesses, np.array(cameras), np.cumsum(sizes) - sizes, np.concatenate(values))
 
-    def agreement(self, points: np.ndarray) -> float:
+    def agreement(self, points: np.ndarray, free: np.ndarray | None = None) -> float:
         """How alike photos look at points [N, 3], 0 to 1: the share of their texture's energy that they have in common.
 
         Σ n m² / Σ t² over points that at least three photos show, t a photo's value there, m their mean. It is
-        greatest where the points lie on the real surface (plane sweep: Collins 1996).
+        greatest where the points lie on the real surface (plane sweep: Collins 1996). Of `free`, [N, V] bool, only
+        photos count in which nothing stands before a point.
         """
         energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
-        run_ranges(_compare_range, len(points), points, self.cameras, self.starts, self.values, AGREEING, energy)
+        free = np.ones((len(points), len(self.cameras)), bool) if free is None else free
+        run_ranges(_compare_range, len(points), points, free, self.cameras, self.starts, self.values, AGREEING, energy)
         common, total = energy.sum(0)
         return float(common / total) if total > 0 else 0.0
 
 
 @exact_kernel  # points may be NaN
-def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
+def _compare_range(lo, hi, points, free, cameras, starts, values, least, energy):
     place, side, down = np.empty(TOGETHER, np.int64), np.empty(TOGETHER), np.empty(TOGETHER)
     count, total, squares = np.empty(TOGETHER), np.empty(TOGETHER), np.empty(TOGETHER)
     x, y, z = np.empty(TOGETHER), np.empty(TOGETHER), np.empty(TOGETHER)
@@ -192,7 +196,7 @@ def _compare_range(lo, hi, points, cameras, starts, values, least, energy):
                 side[i], down[i] = u - left, v - top
                 place[i] = int(top) * row + int(left) if framed else -1
             for i in range(n):
-                if place[i] < 0:
+                if place[i] < 0 or not free[first + i, k]:
                     continue
                 at, s, t = starts[k] + place[i], side[i], down[i]
                 a, b, d, e = values[at], values[at + 1], values[at + row], values[at + row + 1]

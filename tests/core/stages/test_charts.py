@@ -8,6 +8,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from property_tests import examples
 from scenes import REGION, cameras, charts_of
 
 from gimp3d.box import Box
@@ -99,6 +102,23 @@ def room(
         depth = (z * (1 + noise * rng.normal(size=shape))).astype(np.float32)
         witnesses.append(Witness(camera, photo, hidden, some & ~hidden, ~shown, depth))
     return Room(witnesses)
+
+
+def crowded(bare: Room) -> Room:
+    """The same with eight blocks like the object round it, which no box holds."""
+    places = [np.array([x, y, 0]) for x in (-0.8, 0, 0.8) for y in (-0.8, 0, 0.8) if x or y]
+
+    def of(seen: Witness) -> Witness:
+        camera = seen.camera
+        rays = camera.unproject(camera.pixel_centres(), np.ones(seen.hidden.shape)) - camera.centre
+        reach = np.min([block_reach(camera.centre - place, rays) for place in places], axis=0)
+        front = reach < np.where(seen.depth > 0, seen.depth, np.inf)
+        painted = striped(camera.centre + np.where(front, reach, 0)[..., None] * rays)
+        photo = np.where(front[..., None], np.clip(painted, 0, 255), seen.photo).astype(np.uint8)
+        depth = np.where(front, reach, seen.depth).astype(np.float32)
+        return replace(seen, photo=photo, hidden=seen.hidden & ~front, beside=seen.beside & ~front, depth=depth)
+
+    return Room([of(seen) for seen in bare.witnesses])
 
 
 def hidden_everywhere(eyes: tuple[Camera, ...], points: np.ndarray, grow: float) -> np.ndarray:
@@ -205,6 +225,45 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
     assert len(planes) == 2
     for normal, _ in (FLOOR, WALL):
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
+
+
+def test_a_floor_among_things_that_hide_most_of_it_is_told_by_the_photos_that_show_it() -> None:
+    """Photos that show a neighbour say nothing of the floor behind it."""
+    crowd = crowded(room(EYES, [FLOOR], noise=0.005))
+    around = find._surface_round(crowd.witnesses, REGION)
+    on_floor = around.take(np.abs(around.points[:, 2]) < 0.02)
+    said = ask(crowd.witnesses, on_floor.points, find.TOLERANCE)
+    assert (said == Says.BEHIND).sum() > (said == Says.SEEN).sum()
+    textures, points = Textures.make(crowd.witnesses), on_floor.on(Plane.make(np.zeros(3), UP, REGION))
+    assert textures.agreement(points, find._free(on_floor.points, textures)) > textures.agreement(points) + 0.3
+    first = find_planes(crowd.witnesses, REGION)[0]
+    x, y = np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.25, 0.25, 5))
+    assert np.abs(first.points(x, y)[..., 2]).max() < 0.01 * extent(REGION)
+
+
+@pytest.mark.parametrize("other", [-0.2, 0.3])
+@given(st.floats(0.002, 0.02), st.floats(0.0, 0.7), st.integers(0, 99))
+@examples(10)
+def test_what_stands_before_a_surface_or_shows_beyond_it_does_not_tell_how_it_scatters(
+    other: float, sigma: float, share: float, seed: int
+) -> None:
+    (camera, *_), rng = EYES, np.random.default_rng(seed)
+    shape = (camera.height, camera.width)
+    z = np.full(shape, 2.0)
+    points = camera.unproject(camera.pixel_centres(), z).reshape(-1, 3)
+    drawn = z * (1 + sigma * rng.normal(size=shape) + other * (rng.uniform(size=shape) < share))
+    nothing = np.zeros(shape, bool)
+    view = Witness(camera, np.zeros((*shape, 3), np.uint8), nothing, nothing, nothing, drawn.astype(np.float32))
+    assert find.depth_scatter(points, [view]) == pytest.approx(3 * sigma, rel=0.25)
+
+
+def test_a_plane_is_sought_no_farther_off_than_said(floor_room: Room) -> None:
+    textures, around = Textures.make(floor_room.witnesses), find._surface_round(floor_room.witnesses, REGION)
+    floor = Plane.make(np.zeros(3), UP, REGION)
+    for side in (-1, 1):
+        guess = floor.tilted(side * 1.1 * find.SEARCH * extent(REGION), 0, 0)
+        agreement = find._Claim(guess, around, [], floor_room.witnesses, extent(REGION)).agreement(textures)
+        assert agreement(np.array([-side * 1.1 * find.SEARCH, 0, 0])) == 0 < agreement(np.zeros(3))
 
 
 @pytest.mark.parametrize("low", [-0.5, -1.0])
@@ -620,6 +679,12 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     assert foreign[disputed].all() and not foreign[known].any()
     assert rests[27:32, 22].all() and rests[29, 29]  # pixels beside it are mixed
     assert rests[12:18, 37:44].sum() == 1
+
+
+def test_the_object_hides_from_most_what_fewer_photos_show_or_have_something_else_before() -> None:
+    hiding, photos, behind = np.array([[3, 3, 3], [3, 1, 2], [1, 3, 3]], np.uint16)
+    np.testing.assert_array_equal(stage._hides_from_most(hiding, photos, behind), [False] * 3)
+    np.testing.assert_array_equal(stage._hides_from_most(hiding + np.uint16(1), photos, behind), [True, True, True])
 
 
 def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:

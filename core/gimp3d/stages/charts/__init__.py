@@ -251,17 +251,22 @@ def _shown(
     there = _hanging_together(shown_there(said), told)
     hole = _unseen(said) & there
     image, spread, loud = mosaic(points, plane.normal, witnesses, said)
-    photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
+    photos, hiding, behind = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN, Says.BEHIND))
     limit = usual_spread(spread[there & (photos > 1) & ~hole])
     alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
-    hole |= there & (photos > 0) & ~alike & (hiding > photos)
+    hole |= there & (photos > 0) & ~alike & _hides_from_most(hiding, photos, behind)
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
     several = there & (photos > 1) & ~hole
     known = several & (spread <= limit + MISPLACED * loud)
     image = np.where(hole[..., None], mosaic(points, plane.normal, witnesses, beneath)[0], image)
     spread = np.where(several, spread, np.float32(np.nan))
     return _Shown(there, image, photos, hiding, known, several & alike, hole, spread)
+
+
+def _hides_from_most(hiding: np.ndarray, photos: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the object hides it in more photos than show it, and than have something else before it."""
+    return hiding > np.maximum(photos, behind)
 
 
 def _told_by_colours(s: _Shown, object_colours: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -149,22 +149,44 @@ def find_planes(
     found.sort(key=lambda f: -f[0])
     planes: list[Plane] = []
     for _, plane, claim in found:
-        before = max((textures.agreement(claim.own.on(p)) for p in planes), default=0.0)
-        if not planes or 1 - textures.agreement(claim.own.on(plane)) < settings.relief * (1 - before):
+        free = _free(claim.own.points, textures)
+        before = max((textures.agreement(claim.own.on(p), free) for p in planes), default=0.0)
+        if not planes or 1 - textures.agreement(claim.own.on(plane), free) < settings.relief * (1 - before):
             planes.append(replace(plane, told=claim.own.some(SURFACE).on(plane)))
     return tuple(planes)
 
 
 def depth_scatter(points: np.ndarray, witnesses: Sequence[Witness]) -> float:
-    """Three standard deviations, relative to z, of the views' drawn surfaces about points [N, 3] of one."""
+    """Three standard deviations, relative to z, of the views' drawn surfaces about points [N, 3] of one.
+
+    Of the nearer ones, or of the farther ones, if these are closer: some views show what stands before the points, some
+    what lies beyond the surface's end, and that may be most of them.
+    """
+    off = _depths_off(points, witnesses)
+    sides = [np.abs(side) for side in (off[off < 0], off[off > 0]) if len(side)]
+    return min(MOST_SCATTER, *(SCATTER * float(np.median(side)) for side in sides)) if sides else 0.0
+
+
+def _depths_off(points: np.ndarray, witnesses: Sequence[Witness]) -> np.ndarray:
+    """[M]: z of the views' drawn surfaces over that of points [N, 3], less 1; the object's left out."""
     some, off = points[:: max(1, len(points) // SURFACE)], [np.zeros(0)]
     for witness in witnesses:
         _, rows, cols, z = framed(witness.camera, some)
         front = witness.depth[rows, cols]
         shown = ~witness.hidden[rows, cols] & (front > 0)
         off.append(front[shown] / z[shown] - 1)
-    found = np.abs(np.concatenate(off))
-    return min(SCATTER * float(np.median(found)), MOST_SCATTER) if len(found) else 0.0
+    return np.concatenate(off)
+
+
+def _same_surface(points: np.ndarray, witnesses: Sequence[Witness]) -> float:
+    """Relative z within which views draw the surface that points [N, 3] lie on."""
+    return max(TOLERANCE, depth_scatter(points, witnesses))
+
+
+def _free(points: np.ndarray, textures: Textures) -> np.ndarray:
+    """[N, V] bool: in which of the photos nothing stands before points [N, 3] of a surface."""
+    said = ask(textures.witnesses, points, _same_surface(points, textures.witnesses))
+    return np.ascontiguousarray((said != Says.BEHIND).T)
 
 
 def grid(half: float, count: int) -> np.ndarray:
@@ -196,9 +218,11 @@ class _Claim:
     def agreement(
         self, textures: Textures, shrink: int = 1, near: Plane | None = None
     ) -> Callable[[np.ndarray], float]:
-        """What is to be greatest: how alike photos look on the plane, by its pose.
+        """What is to be greatest: how alike photos look on the plane, by its pose; 0 where it is not sought.
 
-        Where most views see through a plane `near` it, such as beyond a shelf's edge, they show other things.
+        Where most views see through a plane `near` it, such as beyond a shelf's edge, they show other things. And so
+        do those in which something stands before what they draw of it: which these are, its pose does not tell, or a
+        false one would agree with itself.
         """
         count = POINTS // shrink
         x, y = (g.ravel() for g in grid(self.half, count))
@@ -206,14 +230,17 @@ class _Claim:
         for other, side in self.bounds:
             there &= side * other.local(points)[:, 2] > 0
         if near is not None:
-            tolerance = max(TOLERANCE, depth_scatter(self.own.some(SURFACE).on(near), self.witnesses))
+            tolerance = _same_surface(self.own.some(SURFACE).on(near), self.witnesses)
             said = ask(self.witnesses, near.under(points), tolerance)
             there &= (said == Says.THROUGH).sum(0) <= np.isin(said, (Says.SEEN, Says.BESIDE)).sum(0)
         x, y, own = x[there], y[there], self.own.some(count**2 // OWN)
+        free = _free(np.concatenate([points[there], own.points]), textures)
 
         def by(pose: np.ndarray) -> float:
+            if not _sought(pose):
+                return 0.0
             round_it = self.plane.points(x, y, pose[0] * self.half + pose[1] * x + pose[2] * y)
-            return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]))
+            return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]), free)
 
         return by
 
@@ -226,6 +253,11 @@ class _Claim:
         right, down, along = self.plane.axes @ other.normal
         offset = (other.origin - self.plane.origin) @ other.normal / along
         return np.array([offset / self.half, -right / along, -down / along])
+
+
+def _sought(pose: np.ndarray) -> bool:
+    """Beyond, photos may agree on something else that they show of the same place, such as the ground round a plinth."""
+    return abs(pose[0]) <= SEARCH
 
 
 def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
