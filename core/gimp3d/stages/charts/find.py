@@ -256,7 +256,7 @@ class _Claim:
 
 
 def _sought(pose: np.ndarray) -> bool:
-    """Beyond, photos may agree on something else that they show of the same place, such as the ground round a plinth."""
+    """Beyond, photos may agree on something else that they show there, such as the ground round a plinth."""
     return abs(pose[0]) <= SEARCH
 
 
