@@ -161,8 +161,8 @@ class Textures:
         """How alike photos look at points [N, 3], 0 to 1: the share of their texture's energy that they have in common.
 
         Σ n m² / Σ t² over points that at least three photos show, t a photo's value there, m their mean. It is
-        greatest where the points lie on the real surface (plane sweep: Collins 1996). Of `free`, [N, V] bool, only
-        photos count in which nothing stands before a point.
+        greatest where the points lie on the real surface (plane sweep: Collins 1996). Of each point only the photos
+        count that are `free` to see it, [N, V] bool; all without.
         """
         energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
         free = np.ones((len(points), len(self.cameras)), bool) if free is None else free
