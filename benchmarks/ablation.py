@@ -22,7 +22,7 @@ import numpy as np
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
-from gimp3d.solvers.edges import REACH
+from gimp3d.solvers.edges import FURTHEST, REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
 from gimp3d.stages.charts import Plane, Surface, find
@@ -53,6 +53,14 @@ def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
 def _scatter_of_all(points: np.ndarray, witnesses: Any) -> float:
     off = np.abs(find._depths_off(points, witnesses))
     return min(MOST_SCATTER, find.SCATTER * float(np.median(off))) if len(off) else 0.0
+
+
+def _hides_from_more(said: np.ndarray) -> np.ndarray:
+    return np.asarray((said == Says.HIDDEN).sum(0) > (said == Says.SEEN).sum(0))
+
+
+def _hidden_by_none_else(unseen: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    return lambda said: unseen(said) & ((said == Says.HIDDEN).sum(0) > (said == Says.BEHIND).sum(0))
 
 
 def _none_both(shown: Shown) -> Shown:
@@ -128,9 +136,8 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what stands before a surface tells how it scatters": tuple(
         (f"gimp3d.stages.{module}:depth_scatter", _scatter_of_all) for module in ("charts", "charts.find")
     ),
-    "the object hides what other things stand before": (
-        ("gimp3d.stages.charts:_hides_from_most", lambda hiding, photos, _: hiding > photos),
-    ),
+    "the object hides what other things stand before": (("gimp3d.stages.charts:_hides_from_most", _hides_from_more),),
+    "what mostly other things hide is no hole": (("gimp3d.stages.charts:_unseen", Around(_hidden_by_none_else)),),
     "what is hidden of a plane lies anywhere on it": (("gimp3d.stages.charts:_placed", Around(_placed_anywhere)),),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
     "what lies on other planes tells of a relief, too": (
@@ -187,6 +194,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "an edge counts beside one that is told better": (("gimp3d.solvers.edges:FIRM", 0.0),),
     "what varies little need not be explained": (("gimp3d.solvers.regularity:LOCALLY", -float("inf")),),
     "an edge is told as far as others, or not": (("gimp3d.solvers.edges:SOON", REACH),),
+    "what lies far beyond a hole ends edges, too": (("gimp3d.solvers.edges:BEYOND", FURTHEST),),
     "what photos disagree on ends edges": (
         ("gimp3d.solvers.exemplar:find_edges", Around(lambda find: lambda *p: find(*p[:3], p[2]))),
     ),

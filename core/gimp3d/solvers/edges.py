@@ -37,7 +37,8 @@ SHARP = 0.5  # share of the step between what is further from it that it must be
 BLOCK = 8  # known px along it: its length is told by so many at a time …
 CLOSEST = 3  # … and it must reach through the blocks next to the hole
 STEADY = 0.5  # share of the usual step that it is in each, and by which two edges' may differ that are one
-CLOSE = 4  # px beyond the hole, with the colours on both sides of an edge, that tell that it runs on to there
+CLOSE = 4  # px beyond the hole, with the colours on both sides of an edge, that tell that it runs on to there …
+BEYOND = 12  # … and half of which others tell that it ended: further off it may have ended where nothing is known
 APART = 6  # px between edges where they run into the hole
 LEAST_HOLE, LEAST_CUT = 64, 6  # pixels of a part of the hole, and px of an edge in it, that are worth it
 MOST = 8  # edges of a part of the hole
@@ -349,7 +350,7 @@ def _settled(
         inwards, beyond = (1, near[1]) if side == BEFORE else (-1, near[0])
         enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
         seen = _goes_on(beyond[:, :CLOSE], telling[0])
-        dark = min(beyond[rows, :, 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
+        dark = min(beyond[rows, :BEYOND, 0].sum() for rows in (ABOVE, BELOW)) < BEYOND
         leaves += inwards * CLOSE * seen
         return told, _Half(edge, inwards, enters, leaves, bool(seen or dark), 0.0)
 

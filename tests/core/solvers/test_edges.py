@@ -133,18 +133,19 @@ def test_an_edge_goes_on_where_nothing_says_that_it_ends() -> None:
     assert len(edges) == 1 and edges[0].origin[0] + edges[0].along[0] * max(edges[0].ends) > MIDDLE + 25
 
 
-@pytest.mark.parametrize("agreed", [True, False])
-def test_a_mat_whose_corner_is_near_goes_on_to_what_photos_disagree_on(agreed: bool) -> None:
-    """Its border is told by 22 px; beyond the hole stands something else, and only where that is sure the mat ends."""
+@pytest.mark.parametrize(("sure", "ends"), [(60, True), (0, False), (30, False)])
+def test_a_mat_whose_corner_is_near_goes_on_to_what_photos_disagree_on(sure: int, ends: bool) -> None:
+    """Its border is told by 22 px; beyond the hole stands something else, and only where that is sure right beside the
+    hole the mat ends: not where only its last pixels are, far off."""
     picture = textured(np.where((X > 3) & (Y < 52), 150.0, 100.0), 6)
     clutter = (Y < -20) & (X < 35)
     picture[clutter] = np.random.default_rng(0).integers(1, 255, (clutter.sum(), 1))
     shown = np.where(HOLE[..., None], np.uint8(0), picture)
-    edges = find_edges(shown, HOLE, ~HOLE, ~HOLE & (agreed | ~clutter))
-    assert len(edges) == (not agreed)
+    edges = find_edges(shown, HOLE, ~HOLE, ~HOLE & ((sure - MIDDLE > Y) | ~clutter))
+    assert len(edges) == (not ends)
     for edge in edges:
-        ends = np.array([edge.origin + t * edge.along - MIDDLE for t in edge.ends])
-        assert np.abs(ends[:, 0] - 3).max() < 6 and ends[:, 1].min() < -28 and 45 < ends[:, 1].max() < 60
+        at = np.array([edge.origin + t * edge.along - MIDDLE for t in edge.ends])
+        assert np.abs(at[:, 0] - 3).max() < 6 and at[:, 1].min() < -28 and 45 < at[:, 1].max() < 60
 
 
 @pytest.mark.parametrize(("gap", "goes_on"), [(5, True), (0, False)])

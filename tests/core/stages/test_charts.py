@@ -138,7 +138,7 @@ def unseen(chart: Chart, witnesses: list[Witness]) -> np.ndarray:
     said = ask(witnesses, surface, chart.tolerance).reshape(-1, *chart.depth.shape)
     count = {s: (said == s).sum(0) for s in Says}
     shown = count[Says.SEEN] + count[Says.BESIDE] + count[Says.THROUGH]
-    return (shown == 0) & (count[Says.HIDDEN] > count[Says.BEHIND])
+    return (shown == 0) & (count[Says.HIDDEN] > 0)
 
 
 def texels(chart: Chart) -> np.ndarray:
@@ -682,9 +682,26 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
 
 
 def test_the_object_hides_from_most_what_fewer_photos_show_or_have_something_else_before() -> None:
-    hiding, photos, behind = np.array([[3, 3, 3], [3, 1, 2], [1, 3, 3]], np.uint16)
-    np.testing.assert_array_equal(stage._hides_from_most(hiding, photos, behind), [False] * 3)
-    np.testing.assert_array_equal(stage._hides_from_most(hiding + np.uint16(1), photos, behind), [True, True, True])
+    def hides(hiding: int, photos: int, behind: int) -> bool:
+        said = [Says.HIDDEN] * hiding + [Says.SEEN] * photos + [Says.BEHIND] * behind + [Says.NOTHING]
+        return bool(stage._hides_from_most(np.array(said, np.uint8)))
+
+    for photos, behind in ((3, 1), (1, 3), (3, 3)):
+        assert hides(4, photos, behind) and not hides(3, photos, behind)
+
+
+def test_what_no_photo_shows_is_hole_where_the_object_hides_it_in_some() -> None:
+    """Beside a neighbour, too, that stands before it in most: once the object is gone the others look at it."""
+    columns = [
+        ([Says.HIDDEN, Says.BEHIND, Says.BEHIND], True),
+        ([Says.HIDDEN, Says.NOTHING, Says.NOTHING], True),
+        ([Says.BEHIND, Says.BEHIND, Says.NOTHING], False),
+        ([Says.HIDDEN, Says.HIDDEN, Says.SEEN], False),
+        ([Says.HIDDEN, Says.HIDDEN, Says.BESIDE], False),
+        ([Says.HIDDEN, Says.THROUGH, Says.THROUGH], False),
+    ]
+    said = np.array([c for c, _ in columns], np.uint8).T[:, None]
+    np.testing.assert_array_equal(stage._unseen(said)[0], [hole for _, hole in columns])
 
 
 def test_a_few_texels_at_the_rim_do_not_end_the_surface_in_the_hole() -> None:

@@ -209,7 +209,7 @@ def _placed(
     places = places.reshape(-1, 3)
     said = ask(witnesses, places, TOLERANCE)
     of_views = said.reshape(-1, *x.shape)
-    hole = _unseen(of_views) & _hanging_together(shown_there(of_views), _told(around))
+    hole = _unseen(of_views) & _hides_from_most(of_views) & _hanging_together(shown_there(of_views), _told(around))
     labels, _ = scipy.ndimage.label(hole)
     hole &= np.isin(labels, np.unique(labels[(np.hypot(x, y) < diagonal) & hole]))
     if not hole.any():
@@ -251,11 +251,11 @@ def _shown(
     there = _hanging_together(shown_there(said), told)
     hole = _unseen(said) & there
     image, spread, loud = mosaic(points, plane.normal, witnesses, said)
-    photos, hiding, behind = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN, Says.BEHIND))
+    photos, hiding = ((said == s).sum(0).astype(np.uint16) for s in (Says.SEEN, Says.HIDDEN))
     limit = usual_spread(spread[there & (photos > 1) & ~hole])
     alike = spread <= limit
     # few photos claim to show what the object hides from most, and they do not agree: they show something before it
-    hole |= there & (photos > 0) & ~alike & _hides_from_most(hiding, photos, behind)
+    hole |= there & (photos > 0) & ~alike & _hides_from_most(said)
     beneath = np.where(hole & (said == Says.HIDDEN), np.uint8(Says.SEEN), np.uint8(Says.NOTHING))
     several = there & (photos > 1) & ~hole
     known = several & (spread <= limit + MISPLACED * loud)
@@ -264,8 +264,9 @@ def _shown(
     return _Shown(there, image, photos, hiding, known, several & alike, hole, spread)
 
 
-def _hides_from_most(hiding: np.ndarray, photos: np.ndarray, behind: np.ndarray) -> np.ndarray:
+def _hides_from_most(said: np.ndarray) -> np.ndarray:
     """[H, W] bool: the object hides it in more photos than show it, and than have something else before it."""
+    hiding, photos, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.SEEN, Says.BEHIND))
     return hiding > np.maximum(photos, behind)
 
 
@@ -335,10 +336,9 @@ def _told(surface: Surface) -> np.ndarray:
 
 
 def _unseen(said: np.ndarray) -> np.ndarray:
-    """[H, W] bool: hidden by the object, rather than by other things, and shown by no photo."""
+    """[H, W] bool: hidden by the object in some photos, and shown by none."""
     seen = np.isin(said, (Says.SEEN, Says.BESIDE)).any(0) | (_through(said) > 0)
-    hidden, behind = ((said == s).sum(0) for s in (Says.HIDDEN, Says.BEHIND))
-    return ~seen & (hidden > behind)
+    return ~seen & (said == Says.HIDDEN).any(0)
 
 
 def _through(said: np.ndarray) -> np.ndarray:
