@@ -22,7 +22,7 @@ import numpy as np
 from gimp3d.errors import BadInput, IllPosed
 from gimp3d.gaussians import ARRAYS
 from gimp3d.pipeline import PRESETS, RemovalSettings
-from gimp3d.solvers.edges import FURTHEST, REACH
+from gimp3d.solvers.edges import ABOVE, BELOW, LEAST, REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
 from gimp3d.stages.charts import Plane, Surface, find
@@ -61,6 +61,10 @@ def _hides_from_more(said: np.ndarray) -> np.ndarray:
 
 def _hidden_by_none_else(unseen: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda said: unseen(said) & ((said == Says.HIDDEN).sum(0) > (said == Says.BEHIND).sum(0))
+
+
+def _little_known(beyond: np.ndarray) -> bool:
+    return min(beyond[rows, ..., 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
 
 
 def _none_both(shown: Shown) -> Shown:
@@ -194,7 +198,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "an edge counts beside one that is told better": (("gimp3d.solvers.edges:FIRM", 0.0),),
     "what varies little need not be explained": (("gimp3d.solvers.regularity:LOCALLY", -float("inf")),),
     "an edge is told as far as others, or not": (("gimp3d.solvers.edges:SOON", REACH),),
-    "what lies far beyond a hole ends edges, too": (("gimp3d.solvers.edges:BEYOND", FURTHEST),),
+    "what lies far beyond a hole ends edges, too": (("gimp3d.solvers.edges:_unknown", _little_known),),
     "what photos disagree on ends edges": (
         ("gimp3d.solvers.exemplar:find_edges", Around(lambda find: lambda *p: find(*p[:3], p[2]))),
     ),

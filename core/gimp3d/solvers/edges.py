@@ -350,9 +350,8 @@ def _settled(
         inwards, beyond = (1, near[1]) if side == BEFORE else (-1, near[0])
         enters, leaves = (float(t) for t in (cut.min(), cut.max())[::inwards])
         seen = _goes_on(beyond[:, :CLOSE], telling[0])
-        dark = min(beyond[rows, :BEYOND, 0].sum() for rows in (ABOVE, BELOW)) < BEYOND
         leaves += inwards * CLOSE * seen
-        return told, _Half(edge, inwards, enters, leaves, bool(seen or dark), 0.0)
+        return told, _Half(edge, inwards, enters, leaves, bool(seen or _unknown(beyond)), 0.0)
 
     for reach in (REACH, SOON)[: 1 + (side != BOTH)]:
         told, found = pattern_search(partial(at, reach=reach), np.eye(2))
@@ -387,6 +386,11 @@ def _is_edge(sums: np.ndarray, border: bool) -> bool:
     far = _step(sums, FAR_ABOVE, FAR_BELOW) @ whole
     parts = not border or far >= STEADY * (whole @ whole)
     return bool(parts and size**2 >= SHARP * far and near.min() >= STEADY * np.median(near))
+
+
+def _unknown(beyond: np.ndarray) -> bool:
+    """Whether too little is known beside an edge's line right beyond the hole to tell that it ended."""
+    return bool(min(beyond[rows, :BEYOND, 0].sum() for rows in (ABOVE, BELOW)) < BEYOND)
 
 
 def _goes_on(beyond: np.ndarray, told_by: np.ndarray) -> bool:
