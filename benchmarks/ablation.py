@@ -25,7 +25,7 @@ from gimp3d.pipeline import PRESETS, RemovalSettings
 from gimp3d.solvers.edges import ABOVE, BELOW, LEAST, REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
-from gimp3d.stages.charts import Plane, Surface, find
+from gimp3d.stages.charts import Chart, Plane, Surface, find
 from gimp3d.stages.charts.find import MOST_SCATTER, flat_surface
 from gimp3d.stages.witness import Says
 
@@ -61,6 +61,14 @@ def _hides_from_more(said: np.ndarray) -> np.ndarray:
 
 def _hidden_by_none_else(unseen: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda said: unseen(said) & ((said == Says.HIDDEN).sum(0) > (said == Says.BEHIND).sum(0))
+
+
+def _led_nowhere(parted: Callable[..., list[Chart]]) -> Callable[..., list[Chart]]:
+    def of(drawn: Sequence[tuple[Chart, np.ndarray]], witnesses: Any) -> list[Chart]:
+        blind = [(replace(c, plane=replace(c.plane, told=None)), spread) for c, spread in drawn]
+        return [replace(c, plane=own.plane) for c, (own, _) in zip(parted(blind, witnesses), drawn)]
+
+    return of
 
 
 def _little_known(beyond: np.ndarray) -> bool:
@@ -154,6 +162,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "surfaces too close for rough depths are all there": (
         ("gimp3d.stages.charts:_parted", lambda drawn, _: [chart for chart, _ in drawn]),
     ),
+    "of two close surfaces either has islands": (("gimp3d.stages.charts:_parted", Around(_led_nowhere)),),
     "one photo tells that the surface ends": (
         ("gimp3d.stages.charts:_through", lambda said: (said == Says.THROUGH).sum(0)),
     ),

@@ -118,7 +118,8 @@ def _parted(drawn: Sequence[tuple[Chart, np.ndarray]], witnesses: Sequence[Witne
     """Charts that lie too close to each other for rough depths to tell which is drawn, such as a wall and a picture on
     it, each where photos agree on it; with every chart, see _chart, by how much they differ.
 
-    The first is there, but where photos' textures differ clearly less on another.
+    The first is there, but where photos' textures differ clearly less on another; there that one hangs together with
+    texels that led to it, or with what is undisputed.
     """
     there = [chart.there for chart, _ in drawn]
     for k, (later, spread) in enumerate(drawn):
@@ -131,10 +132,10 @@ def _parted(drawn: Sequence[tuple[Chart, np.ndarray]], witnesses: Sequence[Witne
             disputed = gap < max(first.tolerance, later.tolerance) * away
             (rows, cols), inside = _texels_at(first, points)
             others = np.where(inside, spread_on_first[rows, cols], np.nan)
-            better = _agree_better(spread, others, disputed)
-            there[k] = there[k] & (better | ~disputed)
+            own = there[k] & (_agree_better(spread, others, disputed) | ~disputed)
+            there[k] = _hanging_together(own, _told(later) | ~disputed)
             (rows, cols), inside = _texels_at(later, first.points())
-            there[j] = there[j] & ~(inside & (better & disputed)[rows, cols])
+            there[j] = there[j] & ~(inside & (there[k] & disputed)[rows, cols])
     return [replace(c, there=t, known=c.known & t, hole=c.hole & t) for (c, _), t in zip(drawn, there)]
 
 
