@@ -559,24 +559,26 @@ def chart_of(depth: np.ndarray, normal: np.ndarray, offset: float, away: float =
     return Chart(*laid, *shown, 0.01, no.astype(np.uint16), scatter=0.0)
 
 
-@pytest.mark.parametrize("led", [True, False])
-def test_a_close_surface_is_there_only_where_it_hangs_together_with_what_led_to_it(led: bool) -> None:
-    """On the floor textures differ as much less in a spot as on the mat: no pixel that led to the mat lies there."""
+@pytest.mark.parametrize(("led", "height"), [(True, 0.0), (False, 0.0), (False, 1.0)])
+def test_a_close_surface_is_there_only_where_it_hangs_together_with_what_led_to_it(led: bool, height: float) -> None:
+    """On the floor textures differ as much less in a spot as on the mat. The mat is there if pixels in the spot led to
+    it, or if it stands so high that the floor is no question."""
     floor_, mat = (chart_of(np.full((120, 160), 5, np.float32), UP, h) for h in (0.0, 0.02))
     right, down = np.meshgrid(np.arange(160), np.arange(120))
     on_mat, spot = right > 110, np.hypot(right - 35, down - 60) < 30
     told = mat.points()[on_mat | (spot & led)]
-    mat = replace(mat, plane=replace(mat.plane, told=told))
+    mat = replace(mat, plane=replace(mat.plane, told=told), depth=mat.depth - np.float32(height) * spot)
     better = np.where(on_mat | spot, np.float32(1), np.float32(8))
     pairs = [(floor_, np.full((120, 160), 4, np.float32)), (mat, better)]
     drawn = [(replace(c, tolerance=0.05, hole=np.ones_like(c.hole)), spread) for c, spread in pairs]
     on_floor, on_it = stage._parted(drawn, [Witness(EYES[0], *np.zeros((5, 1, 1)))])
     for one in (on_floor, on_it):
         np.testing.assert_array_equal(one.hole, one.there)
-    np.testing.assert_array_equal(on_floor.there, ~on_it.there)
+    np.testing.assert_array_equal(on_floor.there, ~on_it.there | (spot & (height > 0)))
     assert on_it.there[right > 125].all() and not on_it.there[(right > 75) & (right < 95)].any()
-    assert on_it.there[np.hypot(right - 35, down - 60) < 10].all() == led
-    assert on_it.there[right < 75].any() == led
+    stays = led or height > 0
+    assert on_it.there[np.hypot(right - 35, down - 60) < 10].all() == stays
+    assert on_it.there[right < 75].any() == stays
 
 
 def rays_of(camera: Camera) -> np.ndarray:
