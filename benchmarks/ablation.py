@@ -26,7 +26,8 @@ from gimp3d.solvers.edges import ABOVE, BELOW, LEAST, REACH
 from gimp3d.solvers.exemplar import EDGE
 from gimp3d.stages.beside import Shown
 from gimp3d.stages.charts import Chart, Plane, Surface, find
-from gimp3d.stages.charts.find import MOST_SCATTER, flat_surface
+from gimp3d.stages.charts.find import MOST_SCATTER
+from gimp3d.stages.charts.lay import flat_surface
 from gimp3d.stages.witness import Says
 
 from .command import kept, parser_of, say, told_in_one_line, write
@@ -102,6 +103,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:OWN", 10**9),
         ("gimp3d.stages.charts.find:ONE_SIDED", 2.0),
     ),
+    "planes are settled by pixels of other planes, too": (("gimp3d.stages.charts.find:SHARED", 0),),
     "planes are settled where views see through them, too": (
         ("gimp3d.stages.charts.find:depth_scatter", lambda *_: np.inf),
     ),
@@ -153,7 +155,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what is hidden of a plane lies anywhere on it": (("gimp3d.stages.charts:_placed", Around(_placed_anywhere)),),
     "a chart goes as far as the object hides anything": (("gimp3d.stages.charts:TRIMMED", (0.0,)),),
     "what lies on other planes tells of a relief, too": (
-        ("gimp3d.stages.charts.find:_drawn_surface", Around(lambda drawn: lambda *p: drawn(*p[:4]))),
+        ("gimp3d.stages.charts.lay:_drawn_surface", Around(lambda drawn: lambda *p: drawn(*p[:4]))),
     ),
     "depths of another surface tell how they scatter": (("gimp3d.stages.charts:MOST_SCATTER", -1.0),),
     "a surface begins anew where it goes through another": (
@@ -222,6 +224,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "averages of patches stay": (("gimp3d.solvers.exemplar:COPIED", 0.0), ("gimp3d.solvers.exemplar:MOSAICS", 0)),
     "what is copied is not matched again": (("gimp3d.solvers.exemplar:MOSAICS", 0),),
     "votes have no say in the mosaic": (("gimp3d.solvers.exemplar:COPIED", 1.0),),
+    "fills have no grain beside what is copied": (
+        ("gimp3d.solvers.exemplar:with_grain", lambda picture, hole, *_: picture[hole]),
+    ),
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),

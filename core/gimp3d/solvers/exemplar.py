@@ -17,6 +17,7 @@ from ..compute.jit import kernel
 from ..compute.threads import run_ranges
 from ..geometry import bounds, dilated
 from .edges import Edge, find_edges, guide_of
+from .grain import with_grain
 from .kriging import Expected, expect
 from .patches import index_patches, lay_out
 from .patchmatch import NearestNeighbourField, PatchMatchSettings, nearest_allowed, patch_centres, refined, upsampled
@@ -83,8 +84,10 @@ def complete_picture(
     hole = level.hole
     sources = image[field.rows[hole], field.cols[hole]]
     misfit = 255 * float(np.sqrt(np.mean((colours[:, :3] - sources / 255) ** 2)))
+    picture = level.channels[..., :3].copy()
+    picture[hole] = _blended(level, field, colours)
     filled = image.copy()
-    filled[hole] = np.clip(np.rint(255 * _blended(level, field, colours)), 0, 255)
+    filled[hole] = np.clip(np.rint(255 * with_grain(picture, hole, level.usable, field)), 0, 255)
     filled[~asked] = given[~asked]  # what was filled besides
     return filled, misfit
 

@@ -175,6 +175,8 @@ def _settled(
     """The motion near a guess that explains most, if that is enough; it turns about the hole."""
     angle, mirrored, shift = guess
     ring, inside, rim = (_thinned(a, n) for a, n in ((band, 4000), (hole, 1000), (known & dilated(hole, RIM), 4000)))
+    if not len(rim[0]):  # photos disagree all round: nothing tells what ends at the hole
+        return None
     shows, of_ring, of_rim = known.astype(np.float32), _variance(image, ring), _variance(image, rim)
     middle = np.argwhere(hole).mean(0)
     target = turn_of(angle, mirrored) @ middle + shift

@@ -12,7 +12,8 @@ from ..box import Region
 from ..compute.threads import parallel_map
 from ..geometry import dilated
 from .charts import scatter_about, shown_there, usual_spread
-from .charts.find import TOLERANCE, flat_surface, lay_surface, pixel_size, surface_beside
+from .charts.find import TOLERANCE, surface_beside
+from .charts.lay import flat_surface, lay_surface, pixel_size
 from .charts.plane import Facing, Plane, extent, largest_plane
 from .witness import Says, Textures, Witness, ask, mosaic
 

@@ -164,11 +164,15 @@ class Textures:
         greatest where the points lie on the real surface (plane sweep: Collins 1996). Of each point only the photos
         count that are `free` to see it, [N, V] bool; all without.
         """
+        common, total = self.energies(points, free).sum(0)
+        return float(common / total) if total > 0 else 0.0
+
+    def energies(self, points: np.ndarray, free: np.ndarray | None = None) -> np.ndarray:
+        """[N, 2]: the energy that photos' textures have in common at each point, and all of it; see agreement."""
         energy, points = np.zeros((len(points), 2)), np.ascontiguousarray(points, np.float64)
         free = np.ones((len(points), len(self.cameras)), bool) if free is None else free
         run_ranges(_compare_range, len(points), points, free, self.cameras, self.starts, self.values, AGREEING, energy)
-        common, total = energy.sum(0)
-        return float(common / total) if total > 0 else 0.0
+        return energy
 
 
 @exact_kernel  # points may be NaN

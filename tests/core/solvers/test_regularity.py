@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
@@ -87,6 +89,17 @@ def test_a_hole_without_surroundings_has_no_motions() -> None:
     picture = np.zeros((40, 50, 3), np.uint8)
     assert find_motions(picture, hole, ~hole) == ()
     assert not continue_regularly(picture, hole, ~hole, ())[1].any()
+
+
+def test_without_a_rim_that_is_known_nothing_tells_what_ends_at_the_hole() -> None:
+    rows, cols = np.mgrid[:120, :160]
+    picture = np.where(((rows // 10 + cols // 10) % 2)[..., None] == 0, np.uint8(60), np.uint8(200)).repeat(3, -1)
+    hole = np.zeros(rows.shape, bool)
+    hole[50:70, 60:100] = True
+    assert find_motions(picture, hole, ~hole)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert find_motions(picture, hole, cv2.dilate(hole.astype(np.uint8), np.ones((13, 13))) == 0) == ()
 
 
 def test_a_large_hole_is_told_as_well() -> None:

@@ -18,7 +18,7 @@ from gimp3d.camera import Camera
 from gimp3d.geometry import sees
 from gimp3d.orbit import look_at
 from gimp3d.stages import charts as stage
-from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits
+from gimp3d.stages.charts import Chart, ChartSettings, Plane, extent, find, find_planes, first_hits, lay
 from gimp3d.stages.ground import look_at as look_round
 from gimp3d.stages.witness import Says, Textures, Witness, ask
 
@@ -277,6 +277,21 @@ def test_a_board_is_not_tilted_by_what_shows_beyond_its_edge(low: float) -> None
     assert np.abs(board.points(x, y)[..., 2]).max() < 0.01 * extent(REGION)
 
 
+@pytest.mark.parametrize(("high", "street"), [(0.08, 1.0), (0.08, 0.3), (0.12, 0.3)])
+def test_of_two_levels_neither_is_a_compromise(high: float, street: float) -> None:
+    """A pavement and the street before it: round the object a slope from one to the other has most of both."""
+
+    def colours(points: np.ndarray) -> np.ndarray:
+        return 120 + np.where(points[..., 2:] < high / 2, street, 1.0) * (texture(3 * points) - 120)
+
+    seen = room(front_cameras(LOW), [(UP, high), FLOOR], noise=0.003, colours=colours, front=0.3)
+    planes = sorted(find_planes(seen.witnesses, REGION), key=lambda p: p.origin[2])
+    assert len(planes) == 2
+    for plane, level in zip(planes, (0, high)):
+        x, y = np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 5))
+        assert np.abs(plane.points(x, y)[..., 2] - level).max() < 0.005 * extent(REGION)
+
+
 def test_a_floor_is_found_though_nearly_all_that_is_round_the_object_is_wall() -> None:
     """From low down the floor is a strip at the object's foot."""
     seen = room(front_cameras((0.3, 0.4, 0.5)), [FLOOR, WALL])
@@ -327,7 +342,7 @@ def test_a_relief_is_of_what_lies_on_no_other_plane() -> None:
     assert flat is not None
     textures = Textures.make(seen.witnesses)
     away = [
-        np.abs(find.lay_surface(flat, REGION, seen.witnesses, textures, others=o).depth - flat.depth).max()
+        np.abs(lay.lay_surface(flat, REGION, seen.witnesses, textures, others=o).depth - flat.depth).max()
         for o in ((), others)
     ]
     assert away[0] > 0.1 * extent(REGION) and away[1] < 0.03 * extent(REGION)
@@ -361,7 +376,7 @@ def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> No
         plane, _, seen = crossing(told)
         flat = stage._placed(replace(plane, told=None), REGION, seen.witnesses, 200)
         assert flat is not None
-        laid = find.Laid(plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
+        laid = lay.Laid(plane, flat.camera, flat.depth, "plane", 0.0, np.nan, (), "")
         chart, _ = stage._chart(laid, REGION, seen.witnesses)
         points = texels(chart).reshape(*chart.depth.shape, 3)
         on_floor = np.abs(points[..., 2]) < 0.01

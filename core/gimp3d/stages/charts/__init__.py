@@ -19,22 +19,19 @@ from ...compute.threads import parallel_map
 from ...geometry import dilated, framed
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
-from .find import CHART as CHART
-from .find import (
+from .find import MOST_SCATTER, TOLERANCE, ChartSettings, depth_scatter
+from .find import find_planes as find_planes
+from .lay import CHART as CHART
+from .lay import (
     HEIGHT,
-    MOST_SCATTER,
     TELLING,
-    TOLERANCE,
-    ChartSettings,
     Laid,
-    depth_scatter,
     flat_surface,
     lay_surface,
     pixel_density,
     pixel_size,
     places_drawn,
 )
-from .find import find_planes as find_planes
 from .plane import Facing, Plane, Surface, extent
 from .plane import Hits as Hits
 from .plane import first_hits as first_hits

@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 
 from ...box import Region, in_region
-from ...camera import Camera
 from ...compute.threads import parallel_map
-from ...geometry import WHOLE, framed, surface_points, window_round
+from ...geometry import framed, surface_points
 from ...schema import AtLeastOne, Share
-from ...solvers.poisson import thin_plate
 from ..witness import AGREEING, Says, Textures, Witness, ask
-from .plane import Plane, Surface, extent, largest_plane
+from .plane import Plane, extent, largest_plane
 
 TOLERANCE = 0.05  # relative z by which a view's surface must be nearer to hide a point: rough scans scatter by 3 to 9 %
 MIXED_RIM = 2.0  # px beside the object whose depths may be its own
@@ -32,18 +30,13 @@ MOST = 4  # planes that are tried: a floor, two walls, and one that rough depths
 LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
 POINTS = 96  # along a side, at which photos are compared at the finest level …
 OWN = 4  # … and one for so many of these that led to the plane: more of them tilt it (two planes on real_bed)
+SHARED = 2  # times that planes are settled again, each by its own pixels of photos
+ABOUT = 2.0  # of these points, σ of the neighbourhood by which such pixels are told
 ONE_SIDED = 0.9  # share of a plane's points that lie on one side of another one if it ends there
 SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sought, and offsets that are tried
 TILT = 0.2  # slope by which it is tilted to begin with: rough depths were 8° off (kitchen_monkey)
 TRIED = 3  # planes of the coarsest level that are followed up
 STEP, COARSE_STEP, FINE_STEP = 0.01, 0.0025, 1e-4  # the pattern search's first and last ones: offset in diagonals
-CHART = "chart"  # split of the cameras that face surfaces
-MARGIN = 8  # px of a view round the part that may show the surface
-CELL = 2  # px of such a camera, side of the cells in which drawn surface is gathered
-ENOUGH_POINTS = 3  # of a cell
-TELLING = 100  # cells or texels that tell how depths lie
-HEIGHT = 0.25  # diagonals of the region, of a relief at most: what is higher stands on the surface
-SINKS = 0.01  # diagonals by which splats are drawn behind their surface at most
 SURFACE = 5000  # points of a surface at which drawn depths are compared
 SCATTER = 3 * 1.4826  # median absolute deviations within which drawn depths scatter: three standard deviations
 MOST_SCATTER = 4 * TOLERANCE  # relative z; depths that scatter more than that lie on another surface
@@ -147,13 +140,23 @@ def find_planes(
     known = [plane for _, plane in settled_at]
     found = [(*_best_known(c, plane, best, known, textures), c) for c, (best, plane) in zip(claims, settled_at)]
     found.sort(key=lambda f: -f[0])
-    planes: list[Plane] = []
-    for _, plane, claim in found:
+    kept = _kept([(plane, claim) for _, plane, claim in found], textures, settings)
+    for _ in range(SHARED if len(kept) > 1 else 0):
+        kept = _kept(_settled_by_own_pixels(kept, textures), textures, settings)
+    return tuple(replace(plane, told=claim.own.some(SURFACE).on(plane)) for plane, claim in kept)
+
+
+def _kept(
+    found: Sequence[tuple[Plane, _Claim]], textures: Textures, settings: ChartSettings
+) -> list[tuple[Plane, _Claim]]:
+    """Those on which photos of their own pixels agree clearly better than on the planes before."""
+    kept: list[tuple[Plane, _Claim]] = []
+    for plane, claim in found:
         free = _free(claim.own.points, textures)
-        before = max((textures.agreement(claim.own.on(p), free) for p in planes), default=0.0)
-        if not planes or 1 - textures.agreement(claim.own.on(plane), free) < settings.relief * (1 - before):
-            planes.append(replace(plane, told=claim.own.some(SURFACE).on(plane)))
-    return tuple(planes)
+        before = max((textures.agreement(claim.own.on(p), free) for p, _ in kept), default=0.0)
+        if not kept or 1 - textures.agreement(claim.own.on(plane), free) < settings.relief * (1 - before):
+            kept.append((plane, claim))
+    return kept
 
 
 def depth_scatter(points: np.ndarray, witnesses: Sequence[Witness]) -> float:
@@ -226,9 +229,8 @@ class _Claim:
         """
         count = POINTS // shrink
         x, y = (g.ravel() for g in grid(self.half, count))
-        points, there = self.plane.points(x, y), np.ones(len(x), bool)
-        for other, side in self.bounds:
-            there &= side * other.local(points)[:, 2] > 0
+        points = self.plane.points(x, y)
+        there = self.inside(points)
         if near is not None:
             tolerance = _same_surface(self.own.some(SURFACE).on(near), self.witnesses)
             said = ask(self.witnesses, near.under(points), tolerance)
@@ -243,6 +245,13 @@ class _Claim:
             return textures.agreement(np.concatenate([round_it, own.on(self.at(pose))]), free)
 
         return by
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """[N] bool, which of points [N, 3] lie on its side of the planes that it ends at."""
+        there = np.ones(len(points), bool)
+        for other, side in self.bounds:
+            there &= side * other.local(points)[:, 2] > 0
+        return there
 
     def at(self, pose: np.ndarray) -> Plane:
         """The guess moved and tilted by [3]: offset over `half`, two slopes."""
@@ -289,6 +298,50 @@ def _best_known(
     return (found[0][0], claim.at(found[0][1])) if found else (best, plane)
 
 
+def _settled_by_own_pixels(found: Sequence[tuple[Plane, _Claim]], textures: Textures) -> list[tuple[Plane, _Claim]]:
+    """Settled again, from where they are and from the guesses, each by the pixels of photos that show it: on which
+    photos agree less about any other plane.
+
+    Else one that meets others, or lies close to them, is a compromise: tilted from a pavement to the street before it.
+    """
+    alike = [_alike_by_view(plane, claim, textures) for plane, claim in found]
+    again = list[tuple[Plane, _Claim]]()
+    for k, (plane, claim) in enumerate(found):
+        others = np.max(alike[:k] + alike[k + 1 :], axis=0)
+        masks = zip(textures.witnesses, others > alike[k])
+        views = [replace(view, hidden=view.hidden | of_others) for view, of_others in masks]
+        agreement = claim.agreement(Textures.make(views), near=plane)
+        starts = [np.zeros(3)] + ([] if plane.crosses(claim.plane) else [claim.pose_of(plane)])
+        best, at = max((_climbed(agreement, start, FINE_STEP) for start in starts), key=lambda climbed: climbed[0])
+        again += [(claim.at(at), claim)] if best > 0 else []
+    return again
+
+
+def _alike_by_view(plane: Plane, claim: _Claim, textures: Textures) -> list[np.ndarray]:
+    """[H, W] float32 of each view: how alike photos look about the place of a plane at a pixel; 0 where none is."""
+    x, y = (g.ravel() for g in grid(claim.half, POINTS))
+    points = plane.points(x, y)
+    energies = textures.energies(points, _free(points, textures)) * claim.inside(points)[:, None]
+    common, total = (cv2.GaussianBlur(e.reshape(POINTS, POINTS), (0, 0), ABOUT) for e in energies.T)
+    alike = np.where(total > 0, common / np.where(total > 0, total, 1), 0).astype(np.float32)
+    tolerance = _same_surface(claim.own.some(SURFACE).on(plane), textures.witnesses)
+    side = 2 * claim.half / POINTS
+    place = np.array([[side, 0, side / 2 - claim.half], [0, side, side / 2 - claim.half], [0, 0, 1]])  # of a cell
+
+    def of(view: Witness) -> np.ndarray:
+        h, w = view.depth.shape
+        c = view.camera
+        frame = c.R @ np.stack([plane.right, plane.down, plane.origin], axis=1) + np.outer(c.t, [0, 0, 1])
+        shown = c.K @ frame - 0.5 * np.outer([1, 1, 0], frame[2])  # pixels of places, times z
+        u, v, one = np.linalg.inv(shown)[2]
+        with np.errstate(divide="ignore"):
+            z = 1 / (u * np.arange(w) + v * np.arange(h)[:, None] + one)
+        met = (z > 0) & ((view.depth == 0) | (view.depth >= (1 - tolerance) * z))
+        return np.where(met, cv2.warpPerspective(alike, shown @ place, (w, h), flags=cv2.INTER_NEAREST), 0)
+
+    return parallel_map(of, textures.witnesses)
+
+
 def _best_of(agreement: Callable[[np.ndarray], float], starts: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
     told = parallel_map(agreement, starts)
     return [starts[k] for k in np.argsort(told)[::-1][:count]]
@@ -306,130 +359,3 @@ def _climbed(agreement: Callable[[np.ndarray], float], start: np.ndarray, least:
         else:
             step /= 2
     return best, at
-
-
-@dataclass(frozen=True)
-class Laid(Surface):
-    """A surface where it lies as far as photos tell."""
-
-    kind: str  # plane | relief
-    agreement: float  # of photos on it, see Textures
-    noise: float  # median distance of the views' drawn surfaces from the plane, scene units
-    others: tuple[Plane, ...]  # planes that it may meet
-    reason: str
-
-
-def flat_surface(plane: Plane, place: np.ndarray, size: np.ndarray, texel: float) -> Surface:
-    """A rectangle of a plane, of a size [2] and round a place, as a camera faces it, with texels of one side."""
-    width, height = (int(n) for n in np.ceil(size / texel))
-    away = 4 * float(np.linalg.norm(size))
-    rotation = np.stack([plane.right, -plane.down, -plane.normal])
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (place + away * plane.normal)
-    camera = Camera("chart", width, height, away / texel, away / texel, width / 2, height / 2, viewmat, CHART)
-    return Surface(plane, camera, np.full((height, width), away, np.float32))
-
-
-def pixel_density(points: np.ndarray, normal: np.ndarray, camera: Camera) -> np.ndarray:
-    """[N]: pixels of a view on a unit of surface at points [N, 3]; 0 where it does not face the view."""
-    z, towards = camera.project(points)[1], camera.centre - points
-    cosine = (towards @ normal) / np.linalg.norm(towards, axis=1)
-    facing = (z > 0) & (cosine > 0)
-    return np.where(facing, camera.fx * camera.fy * cosine / np.where(facing, z, 1) ** 2, 0)
-
-
-def pixel_size(place: np.ndarray, normal: np.ndarray, views: Sequence[Witness]) -> float:
-    """Side of a pixel on a surface, scene units, in the views that show the place best; infinite if none faces it."""
-    density = np.array([pixel_density(place[None], normal, v.camera)[0] for v in views])
-    facing = density[density > 0]
-    return 1 / math.sqrt(float(np.percentile(facing, 90))) if len(facing) else math.inf
-
-
-def lay_surface(
-    flat: Surface,  # at the plane
-    region: Region,
-    witnesses: Sequence[Witness],
-    textures: Textures,
-    settings: ChartSettings = ChartSettings(),
-    enough: float = math.inf,  # points that tell where a few texels lie, where views show more
-    others: tuple[Plane, ...] = (),  # that it may meet
-) -> Laid:
-    """A relief if photos agree clearly better on it than on the plane; else the plane, laid onto the drawn surface."""
-
-    def at(offset: np.ndarray | float, kind: str) -> Laid:
-        laid = Laid(flat.plane, flat.camera, (flat.depth + offset).astype(np.float32), kind, 0.0, np.nan, others, "")
-        agreement = textures.agreement(laid.points().reshape(-1, 3))
-        return replace(laid, agreement=agreement, reason=f"photos agree by {agreement:.2f}")
-
-    level, diagonal = at(0.0, "plane"), extent(region)
-    offset, known = _drawn_surface(flat, witnesses, HEIGHT * diagonal, enough, others, INLIER * diagonal)
-    if known.sum() < TELLING:
-        return level
-    relief = at(_completed(offset, known, flat), "relief")
-    # near splats cover far ones, so all seem to stand higher: trained ones lie as much lower, and so must new ones
-    near = offset[known & (np.abs(offset) < SINKS * diagonal)]
-    sunk = at(float(np.median(near)) if len(near) > TELLING else 0.0, "plane")
-    return replace(
-        relief if 1 - relief.agreement < settings.relief * (1 - level.agreement) else sunk,
-        reason=f"{level.reason} on the plane, {relief.agreement:.2f} on the relief",
-        noise=float(np.median(np.abs(offset[known]))),
-    )
-
-
-def places_drawn(plane: Plane, half: float, count: int, witnesses: Sequence[Witness], height: float) -> np.ndarray:
-    """[count, count, 3] places on what views draw no higher than so much over a square of a plane, completed."""
-    flat = flat_surface(plane, plane.origin, np.full(2, 2 * half), 2 * half / count)
-    offset, known = _drawn_surface(flat, witnesses, height, math.inf)
-    if known.sum() < TELLING:
-        return flat.points()
-    return replace(flat, depth=flat.depth + _completed(offset, known, flat)).points()
-
-
-def _completed(offset: np.ndarray, known: np.ndarray, flat: Surface) -> np.ndarray:
-    """[H, W] float32: offsets, see _drawn_surface, smoothly where they are not known."""
-    completed = np.nan_to_num(thin_plate(offset, known, np.ones(known.shape, bool))).astype(np.float32)
-    return cv2.resize(completed, flat.depth.shape[::-1], interpolation=cv2.INTER_LINEAR)
-
-
-def _drawn_surface(
-    flat: Surface,
-    witnesses: Sequence[Witness],
-    height: float,
-    enough: float,
-    others: Sequence[Plane] = (),
-    on_others: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """z of what views draw no higher than so much over a plane less the plane's, in cells of a few texels, and where
-    that is known. Both [h, w]; the median over the views' points.
-
-    Points that lie within a distance on another plane, and nearer to it than to this one, tell of that.
-    """
-    camera, away = flat.camera, flat.depth[0, 0]
-    h, w = -(-camera.height // CELL), -(-camera.width // CELL)
-    ends = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
-    corners = camera.unproject(ends, np.full(4, away, float))
-    middle = corners.mean(0)
-
-    def of(view: Witness) -> np.ndarray:
-        uv, front = view.camera.project(corners)
-        window = window_round(uv, view.camera, MARGIN) if (front > 0).all() else WHOLE
-        z_there = float(view.camera.project(middle[None])[1][0])
-        side = CELL * away / camera.fx * view.camera.fx / z_there if z_there > 0 else 1  # of a cell, in px
-        step = max(1, int(side * math.sqrt(len(witnesses) / enough)))
-        points = surface_points(view.camera, view.depth_beside, window, step)[2]
-        off = np.abs(flat.plane.local(points)[:, 2])
-        own = off < height
-        for other in others:
-            beside = np.abs(other.local(points)[:, 2])
-            own &= (beside > on_others) | (beside > off)
-        points = points[own]
-        _, rows, cols, z = framed(camera, points)
-        # sorted as one number: the cell, then z, whose bits are in order as it is positive
-        return (rows // CELL * w + cols // CELL).astype(np.uint64) << 32 | z.astype(np.float32).view(np.uint32)
-
-    found = np.sort(np.concatenate(parallel_map(of, witnesses)))
-    count = np.bincount((found >> 32).astype(np.int64), minlength=h * w)
-    known, value = count >= ENOUGH_POINTS, np.zeros(h * w)
-    middle = found[(np.cumsum(count) - count + count // 2)[known]]
-    value[known] = middle.astype(np.uint32).view(np.float32)
-    return np.where(known, value - away, 0).reshape(h, w), known.reshape(h, w)
