@@ -230,6 +230,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),
+    "sheen may be an image": (("gimp3d.stages.reflection:_without_slopes", lambda values, *_: values),),
     "dark rims where it stands stay": (("gimp3d.stages.shadow:CHANCE", math.inf),),
     "a light need not beat chance": (("gimp3d.stages.light_search:EARNS", 1e-9),),
     "a light need not explain what is uneven": (("gimp3d.stages.light_search:FITS", 1e-9),),

@@ -12,10 +12,12 @@ import itertools
 import cv2
 import numpy as np
 
+from ..geometry import bounds
 from .patchmatch import NearestNeighbourField
 
 FINE = 2.0  # px, σ of the blur that leaves detail out
 ABOUT = 8.0  # px, σ of the neighbourhood whose detail is compared
+REACH = 33  # px, farther than that goes
 WINDOW = 16  # px, half a side of what is copied from one place
 LOUD = 3.0  # times the median of detail: what is louder is an edge, of which only so much is copied
 LEAST = 1e-12  # squared colours: far below a grey level
@@ -32,15 +34,17 @@ def with_grain(picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field:
     weight, copied = (np.array(part) for part in zip(*parts))
     if not weight.any():
         return picture[hole]
+    box = bounds(hole, REACH)
+    here, laid = hole[box], np.zeros_like(picture[box])
     most = LOUD * np.median(np.abs(copied[weight[..., 0] > 0]), axis=0)
-    copied, own = (np.clip(d, -most, most) for d in (copied, _detail(picture, usable | hole)[hole]))
+    own = _detail(picture[box], usable[box] | here)[here]
+    copied, own = (np.clip(d, -most, most) for d in (copied, own))
     grain = (weight * copied).sum(0) / np.sqrt(np.maximum((weight**2).sum(0), LEAST))
     usual = (weight * copied**2).sum((0, 2)) / np.maximum(weight.sum((0, 2)), LEAST)
-    laid = np.zeros_like(picture)
-    laid[hole] = grain
-    felt = _detail(laid, hole)[hole]  # a blur leaves some of it out again
+    laid[here] = grain
+    felt = _detail(laid, here)[here]  # a blur leaves some of it out again
     energies = usual - (own**2).sum(1), (felt**2).sum(1), (own * felt).sum(1)
-    lacking, energy, common = (np.maximum(_about(e, hole), 0) for e in energies)
+    lacking, energy, common = (np.maximum(_about(e, here), 0) for e in energies)
     more = (np.sqrt(common**2 + energy * lacking) - common) / np.maximum(energy, LEAST)
     return (picture[hole] + more[:, None] * grain).astype(np.float32)
 

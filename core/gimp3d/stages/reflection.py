@@ -93,26 +93,39 @@ def _sampled(
     return tuple(colours_at(p.astype(np.float32), at) for p in (photo, *mirror_image(gaussians, plane, camera)))
 
 
+def _without_slopes(values: np.ndarray, seen: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Values [V, T, C] of views, less what changes evenly across each: of a sheen every view has more on its own side.
+
+    `seen` is [V, T] bool, `places` on the plane are [T, 2].
+    """
+    slopes, left = np.column_stack([np.ones(len(places)), places]), values.astype(np.float64)
+    for of_view, shown in zip(left, seen):
+        if shown.any():
+            of_view -= slopes @ np.linalg.lstsq(slopes[shown], of_view[shown], rcond=None)[0]
+    return left
+
+
 def _fitted(
-    seen: np.ndarray, photo: np.ndarray, alpha: np.ndarray, light: np.ndarray
+    seen: np.ndarray, places: np.ndarray, photo: np.ndarray, alpha: np.ndarray, light: np.ndarray
 ) -> tuple[np.ndarray, float, float]:
     """How a mirror image explains differences between photos: strengths [2, 3] of `image` and `elsewhere`, see
     Reflection; by how much it lowers the squared differences, in units of noise; and what share of them, where it is
     and noise left out.
 
-    V views show T texels where `seen` [V, T] bool, linear light: photos [V, T, 3], the mirror image's alpha [V, T] and
-    its light times alpha [V, T, 3].
+    V views show T texels at places [T, 2] of the plane where `seen` [V, T] bool, linear light: photos [V, T, 3], the
+    mirror image's alpha [V, T] and its light times alpha [V, T, 3].
     """
     found, gain, explained, uneven = np.zeros((2, 3)), 0.0, 0.0, 0.0
     there = seen & (alpha > MIRRORED)
     if not seen.any():  # few views, or none of one place
         return found, 0.0, 0.0
+    values = _without_slopes(np.concatenate([photo, light, -alpha[..., None]], axis=2), seen, places)
     for channel in range(3):
         weight = seen.astype(np.float64)
         for _ in range(ROUNDS):
             shown, bright, dark = (
                 v - (weight * v).sum(0) / np.maximum(weight.sum(0), 1e-9)
-                for v in (photo[..., channel], light[..., channel], -alpha)
+                for v in (values[..., channel], values[..., 3 + channel], values[..., 6])
             )
             bends = np.array([[(weight * a * b).sum() for b in (bright, dark)] for a in (bright, dark)])
             slopes = np.array([(weight * a * shown).sum() for a in (bright, dark)])
@@ -154,7 +167,8 @@ def find_reflection(
 
     def fit(gaussians: Gaussians) -> tuple[np.ndarray, float, float]:
         parts = parallel_map(lambda w: _sampled(points, w, texel, gaussians, plane), used)
-        return _fitted(seen[:, several], *(np.array([p[k] for p in parts])[:, several] for k in range(3)))
+        samples = (np.array([p[k] for p in parts])[:, several] for k in range(3))
+        return _fitted(seen[:, several], plane.local(points[several])[:, :2], *samples)
 
     strength, gain, share = fit(object_)
     words = f"the mirror image explains {share:.0%} of how photos differ where it is"

@@ -14,6 +14,7 @@ from gimp3d.box import Box
 from gimp3d.evaluate import psnr
 from gimp3d.pipeline import PRESETS, RemovalResult, View, remove_object, render_bytes
 from gimp3d.raster import render
+from gimp3d.stages import reflection
 from gimp3d.stages.charts import Plane
 from gimp3d.stages.reflection import mirror_image
 
@@ -90,6 +91,24 @@ def test_what_else_differs_between_views_is_no_reflection() -> None:
         uneven.append(replace(view, image=image))
     result = remove_object(scene.gaussians, uneven, scene.region, PRESETS["draft"])
     assert not result.reflection["found"]
+
+
+@pytest.mark.parametrize(("image", "sheen"), [(0.0, 0.1), (0.0, -0.1), (0.2, 0.1), (0.2, 0.0)])
+def test_a_sheen_on_every_viewer_s_side_is_no_image(image: float, sheen: float) -> None:
+    """On a plinth's top the image of what stands there lies on the viewer's side, and so does what is seen steeper."""
+    x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-1, 1, 41)] * 2))
+    places = np.stack([x, y], 1)[np.hypot(x, y) < 1]
+    angles = np.radians(np.arange(0, 360, 20))[:, None]
+    near, across = (np.cos(a) * places[:, 0] + np.sin(a) * places[:, 1] for a in (angles, angles + np.pi / 2))
+    alpha = ((near > 0.2) & (np.abs(across) < 0.4)).astype(float)
+    light = 0.8 * alpha[..., None] * np.ones(3)
+    noise = np.random.default_rng(1).normal(0, 0.002, (*alpha.shape, 3))
+    photo = 0.4 + sheen * near[..., None] + image * light + noise
+    strength, _, share = reflection._fitted(np.ones(alpha.shape, bool), places, photo, alpha, light)
+    if image:
+        assert share > 0.8 and strength[0].mean() == pytest.approx(image, rel=0.1)
+    else:
+        assert share < 0.3
 
 
 def test_left_alone_nothing_changes() -> None:
