@@ -300,21 +300,23 @@ def _best_known(
 
 def _settled_by_own_pixels(found: Sequence[tuple[Plane, _Claim]], textures: Textures) -> list[tuple[Plane, _Claim]]:
     """Settled again, from where they are and from the guesses, each by the pixels of photos that show it: on which
-    photos agree less about any other plane.
+    photos agree less about any other plane. In the order of how well they agree in all.
 
     Else one that meets others, or lies close to them, is a compromise: tilted from a pavement to the street before it.
     """
     alike = [_alike_by_view(plane, claim, textures) for plane, claim in found]
-    again = list[tuple[Plane, _Claim]]()
+    again = list[tuple[float, Plane, _Claim]]()
     for k, (plane, claim) in enumerate(found):
-        others = np.max(alike[:k] + alike[k + 1 :], axis=0)
-        masks = zip(textures.witnesses, others > alike[k])
-        views = [replace(view, hidden=view.hidden | of_others) for view, of_others in masks]
+        others = alike[:k] + alike[k + 1 :]
+        of_others = (np.max([a[v] for a in others], axis=0, initial=0) > own for v, own in enumerate(alike[k]))
+        views = [replace(view, hidden=view.hidden | mask) for view, mask in zip(textures.witnesses, of_others)]
         agreement = claim.agreement(Textures.make(views), near=plane)
         starts = [np.zeros(3)] + ([] if plane.crosses(claim.plane) else [claim.pose_of(plane)])
         best, at = max((_climbed(agreement, start, FINE_STEP) for start in starts), key=lambda climbed: climbed[0])
-        again += [(claim.at(at), claim)] if best > 0 else []
-    return again
+        if best > 0:
+            again.append((claim.agreement(textures, near=plane)(at), claim.at(at), claim))
+    again.sort(key=lambda f: -f[0])
+    return [(plane, claim) for _, plane, claim in again]
 
 
 def _alike_by_view(plane: Plane, claim: _Claim, textures: Textures) -> list[np.ndarray]:
