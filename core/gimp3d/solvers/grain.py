@@ -15,10 +15,11 @@ import numpy as np
 from ..geometry import bounds
 from .patchmatch import NearestNeighbourField
 
-FINE = 2.0  # px, σ of the blur that leaves detail out
+FINE, BROAD = 2.0, 4.0  # px, σ of the blurs: that leaves detail out, and whose colours tell where it may lie
 ABOUT = 8.0  # px, σ of the neighbourhood whose detail is compared
 REACH = 33  # px, farther than that goes
 WINDOW = 16  # px, half a side of what is copied from one place
+LIKE = 20 / 255  # by which such colours may differ: beyond, it is another material's detail, or their edge
 LOUD = 3.0  # times the median of detail: what is louder is an edge, of which only so much is copied
 LEAST = 1e-12  # squared colours: far below a grey level
 
@@ -29,20 +30,25 @@ def with_grain(picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field:
     `hole` and `usable`, what may be copied, are [H, W] bool; the field tells what patches of the hole resemble. Detail
     that a place has already counts: where a brick's joint is, the same joint is not added.
     """
-    places, detail = np.argwhere(hole), _detail(picture, usable)
-    parts = [_in_windows(detail, usable, field, places, first) for first in itertools.product((0, WINDOW), (0, WINDOW))]
+    box = bounds(hole, REACH)
+    here, laid = hole[box], np.zeros_like(picture[box])
+    places, filled = np.argwhere(hole), (picture[box], usable[box] | here)
+    detail, around = picture - _blurred(picture, usable, FINE), _blurred(picture, usable, BROAD)
+    own, own_around = (picture[box] - _blurred(*filled, FINE))[here], _blurred(*filled, BROAD)[here]
+    parts = []
+    for first in itertools.product((0, WINDOW), (0, WINDOW)):
+        weight, (v, u) = _in_windows(usable, field, places, first)
+        like = np.abs(around[v, u] - own_around).max(1) < LIKE
+        parts.append(((weight * like)[:, None], detail[v, u]))
     weight, copied = (np.array(part) for part in zip(*parts))
     if not weight.any():
         return picture[hole]
-    box = bounds(hole, REACH)
-    here, laid = hole[box], np.zeros_like(picture[box])
     most = LOUD * np.median(np.abs(copied[weight[..., 0] > 0]), axis=0)
-    own = _detail(picture[box], usable[box] | here)[here]
     copied, own = (np.clip(d, -most, most) for d in (copied, own))
     grain = (weight * copied).sum(0) / np.sqrt(np.maximum((weight**2).sum(0), LEAST))
     usual = (weight * copied**2).sum((0, 2)) / np.maximum(weight.sum((0, 2)), LEAST)
     laid[here] = grain
-    felt = _detail(laid, here)[here]  # a blur leaves some of it out again
+    felt = (laid - _blurred(laid, here, FINE))[here]  # a blur leaves some of it out again
     energies = usual - (own**2).sum(1), (felt**2).sum(1), (own * felt).sum(1)
     lacking, energy, common = (np.maximum(_about(e, here), 0) for e in energies)
     more = (np.sqrt(common**2 + energy * lacking) - common) / np.maximum(energy, LEAST)
@@ -50,11 +56,12 @@ def with_grain(picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field:
 
 
 def _in_windows(
-    detail: np.ndarray, usable: np.ndarray, field: NearestNeighbourField, places: np.ndarray, first: tuple[int, int]
+    usable: np.ndarray, field: NearestNeighbourField, places: np.ndarray, first: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights [N, 1] and details [N, 3] at places [N, 2], each copied from where the middle of its window is from.
+    """Weights [N] of places [N, 2], and the rows and columns [2, N] that they are copied from.
 
-    Windows lie side by side from a row and column on; with those half a side further, weights sum to 1.
+    They are from as far off as the middles of their windows. Windows lie side by side from a row and column on;
+    with those half a side further, weights sum to 1.
     """
     size = np.array(usable.shape)
     middle = (places - first) // (2 * WINDOW) * (2 * WINDOW) + WINDOW + first
@@ -64,14 +71,14 @@ def _in_windows(
     v, u = np.clip(source, 0, size - 1).T
     inside = (source >= 0).all(1) & (source < size).all(1)
     weight = np.where(field.found[y, x] & inside & usable[v, u], weight, 0)
-    return weight[:, None], detail[v, u]
+    return weight, np.stack([v, u])
 
 
-def _detail(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    """[H, W, 3]: what a blur leaves out, of the pixels [H, W] bool that are shown."""
+def _blurred(picture: np.ndarray, shown: np.ndarray, sigma: float) -> np.ndarray:
+    """[H, W, 3]: of the pixels [H, W] bool that are shown."""
     weight = shown.astype(np.float32)
-    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), FINE)
-    return picture - total / np.maximum(cv2.GaussianBlur(weight, (0, 0), FINE), 1e-3)[..., None]
+    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), sigma)
+    return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)[..., None])
 
 
 def _about(values: np.ndarray, hole: np.ndarray) -> np.ndarray:

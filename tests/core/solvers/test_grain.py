@@ -44,7 +44,7 @@ def filled(picture: np.ndarray, field: NearestNeighbourField) -> np.ndarray:
 
 
 @examples(20)
-@given(st.integers(0, 999), st.floats(0.01, 0.2), st.floats(0.0, 0.9))
+@given(st.integers(0, 999), st.floats(0.01, 0.12), st.floats(0.0, 0.9))
 def test_a_smooth_fill_gets_the_detail_of_what_it_continues(seed: int, contrast: float, had: float) -> None:
     """Whether it has none, or some of its own."""
     truth = grainy(seed, contrast)
@@ -75,6 +75,16 @@ def test_edges_are_no_grain() -> None:
     truth[20:23] = 1.0
     smooth = np.where(HOLE[..., None], np.float32(0.5), truth)
     done = filled(smooth, copied_from(-50, 0))
+    assert np.abs(done[HOLE] - 0.5).max() < 0.1
+
+
+def test_detail_of_another_material_is_none() -> None:
+    """Windows reach over a border that what is filled has not: neither its edge nor the other's grain comes with it."""
+    truth = grainy(5, 0.02)
+    truth[:30] = 0.1 + 4 * (truth[:30] - 0.5)
+    smooth = np.where(HOLE[..., None], np.float32(0.5), truth)
+    done = filled(smooth, copied_from(-40, 0))  # rows up to 70 are from beyond the border
+    assert detail(done, HOLE) < 1.3 * detail(truth, np.arange(SHAPE[0])[:, None].repeat(SHAPE[1], 1) > 112)
     assert np.abs(done[HOLE] - 0.5).max() < 0.1
 
 
