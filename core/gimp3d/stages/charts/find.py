@@ -114,8 +114,9 @@ def find_planes(
     Each counts by the square of the share of views in which the object hides it: what is hidden often lies near what is
     hidden always. Planes are then settled where photos' textures agree best, as rough splats' depths do not tell: at
     the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
-    painted on those. Of two planes that could both be what some pixels show photos choose as well. Fewer than three
-    photos cannot judge: the planes are as they are drawn then.
+    painted on those. Of two planes that could both be what some pixels show photos choose as well, and where several
+    stay, each is settled again by the pixels that show it. Fewer than three photos cannot judge: the planes are as they
+    are drawn then.
     """
     diagonal, cameras = extent(region), np.array([w.camera.centre for w in witnesses])
     left, rng = _surface_round(witnesses, region), np.random.default_rng(0)
