@@ -227,6 +227,8 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "fills have no grain beside what is copied": (
         ("gimp3d.solvers.exemplar:with_grain", lambda picture, hole, *_: picture[hole]),
     ),
+    "loud detail is grain, too": (("gimp3d.solvers.grain:LOUD", 1e9),),
+    "detail of other materials is grain, too": (("gimp3d.solvers.grain:LIKE", math.inf),),
     "Telea's fill": (("inpaint", "telea"),),
     # the object's light
     "shadows and reflections stay": (("shadow", "off"),),
