@@ -25,6 +25,7 @@ from .witness import Witness
 STRIDE = 4  # px between those that are asked first
 EVEN = 0.02  # share of light up to which their neighbours are as they are
 DARKEST = 0.3  # share of light below which a photo holds too little texture to be lifted: it is filled
+BRIGHTEST = 0.999  # share of lit ground that is no brighter: the rest is glints
 BRIGHTER = 8.0  # grey levels by which lifted ground may be brighter than lit: else less light is missing there
 PATCH = 9  # px in which a photo and the ground are compared
 ALIKE = 20.0  # grey levels by which they may differ
@@ -87,8 +88,14 @@ def lift(
 
 
 def lifted_photos(shadow: Shadow, witnesses: Sequence[Witness]) -> list[Undone]:
-    """Of each view: the photo without the shadow."""
-    return parallel_map(lambda w: _lifted(w, light_in(shadow, w)), witnesses)
+    """Of each view: the photo without the shadow.
+
+    How bright lit ground is all views tell: one may show a white line's lifted part alone.
+    """
+    arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
+    levels = np.cumsum(sum(a.lit for a in arriving))
+    brightest = int(np.searchsorted(levels, BRIGHTEST * levels[-1])) if levels[-1] else 255
+    return parallel_map(lambda of: _lifted(*of, brightest), zip(witnesses, arriving))
 
 
 @dataclass(frozen=True)
@@ -98,7 +105,7 @@ class Arriving:
     window: Window
     light: np.ndarray  # [h, w, 3] float32, the share of light that arrives at what is shown
     ground: np.ndarray  # [h, w] bool, where that is ground
-    brightest: float  # grey level of ground that is not in the shadow
+    lit: np.ndarray  # [256] int64, pixels of ground that is not in the shadow by their brightest channel's level
 
 
 def _grey(light: np.ndarray) -> np.ndarray:
@@ -106,8 +113,8 @@ def _grey(light: np.ndarray) -> np.ndarray:
     return cv2.transform(light, np.full((1, 3), 1 / 3))
 
 
-def _lifted(witness: Witness, arriving: Arriving) -> Undone:
-    """A photo without the shadow."""
+def _lifted(witness: Witness, arriving: Arriving, brightest: int) -> Undone:
+    """A photo without the shadow, where ground is no brighter than so many grey levels."""
     photo, light = witness.photo.copy(), np.full(witness.hidden.shape, 255, np.uint8)
     shaded, dark = np.zeros((2, *light.shape), bool)
     part, window = witness.cropped(arriving.window), arriving.window
@@ -119,7 +126,7 @@ def _lifted(witness: Witness, arriving: Arriving) -> Undone:
     bright = encoded(linear(part.photo[inside]) / np.maximum(arriving.light[inside], DARKEST))
     photo[shaded] = np.clip(np.rint(bright * 255), 0, 255)
     too_bright = np.zeros(inside.shape, np.uint8)
-    too_bright[inside] = 255 * bright.max(-1) > arriving.brightest + BRIGHTER
+    too_bright[inside] = 255 * bright.max(-1) > brightest + BRIGHTER
     too_bright &= arriving.ground
     dark[window] |= cv2.morphologyEx(too_bright, cv2.MORPH_OPEN, np.ones((3, 3))) > 0  # single pixels are grain
     return photo, shaded, dark, light
@@ -154,7 +161,7 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     ask(*(i.ravel() for i in np.broadcast_arrays(*grid)))
     few = out[grid]
     if few.min() > UNTOUCHED:
-        return Arriving(window, np.ones_like(out), on >= 0, 255.0)
+        return Arriving(window, np.ones_like(out), on >= 0, np.zeros(256, int))
     kernel, dim = np.ones((3, 3), np.uint8), _grey(few)
     steps, borders = (cv2.morphologyEx(a, cv2.MORPH_GRADIENT, kernel) for a in (dim, on[grid].astype(np.float32)))
     uneven = (steps > EVEN) | ((borders > 0) & (cv2.erode(dim, kernel) < UNTOUCHED))
@@ -163,8 +170,7 @@ def light_in(shadow: Shadow, witness: Witness) -> Arriving:
     out = np.ascontiguousarray(cv2.remap(few, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
     ask(*np.nonzero(cv2.remap(uneven.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)))
     lit = (on >= 0) & ~witness.hidden & (_grey(out) >= UNTOUCHED)
-    brightest = float(np.percentile(witness.photo[lit].max(-1), 99.9)) if lit.any() else 255.0
-    return Arriving(window, out, on >= 0, brightest)
+    return Arriving(window, out, on >= 0, np.bincount(witness.photo[lit].max(-1), minlength=256))
 
 
 def _shows(witness: Witness, grounds: Sequence[Ground], hits: Hits) -> np.ndarray:

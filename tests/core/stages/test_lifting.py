@@ -7,6 +7,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+import pytest
 from lit_scenes import Lamp, make_scene
 
 from gimp3d.camera import Camera
@@ -14,12 +15,15 @@ from gimp3d.gaussians import Gaussians
 from gimp3d.presets import PRESETS
 from gimp3d.raster import render_bytes
 from gimp3d.run import ViewState
+from gimp3d.stages import lifting
 from gimp3d.stages.exposure import exposures_of
 from gimp3d.stages.lifting import Arriving, _lifted, light_in, recoloured
 from gimp3d.stages.masks import find_masks
 from gimp3d.stages.shadow import Shadow
 from gimp3d.stages.witness import Witness
 from gimp3d.steps.behind import find_light, find_surfaces
+
+LEVELS = np.zeros(256, int)  # of lit ground
 
 
 @cache
@@ -65,8 +69,8 @@ def test_dim_pixels_right_beside_the_object_are_filled_and_not_lifted() -> None:
     window = slice(0, 30), slice(0, 40)
     near = cv2.dilate((hidden | beside).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for light, filled in ((0.9, near & False), (0.6, near & ~hidden), (0.2, ~hidden)):
-        arriving = Arriving(window, np.full((30, 40, 3), light, np.float32), ~hidden, 255.0)
-        photo, shaded, dark, _ = _lifted(witness, arriving)
+        arriving = Arriving(window, np.full((30, 40, 3), light, np.float32), ~hidden, LEVELS)
+        photo, shaded, dark, _ = _lifted(witness, arriving, 255)
         np.testing.assert_array_equal(dark, filled)
         np.testing.assert_array_equal(shaded, ~hidden)
         assert (photo[shaded] > 60).all() and (photo[hidden] == 60).all()
@@ -85,11 +89,36 @@ def test_what_would_be_brighter_than_lit_ground_is_filled_and_not_lifted() -> No
     ground[:10] = False
     window = slice(0, 30), slice(0, 40)
     witness = Witness(camera, photo, no, no, no, np.ones((30, 40), np.float32))
-    lifted, shaded, filled, _ = _lifted(witness, Arriving(window, light, ground, 192.0))
+    lifted, shaded, filled, _ = _lifted(witness, Arriving(window, light, ground, LEVELS), 192)
     assert shaded.sum() == 600 and abs(int(lifted[20, 8, 0]) - 190) < 8
     expected = no.copy()
     expected[10:25, 20:35] = True
     np.testing.assert_array_equal(filled, expected)
+
+
+def test_a_line_whose_lit_part_only_other_views_show_is_lifted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A white line beside a van: where a view shows it in shade alone, lit ground seemed darker, and it was filled."""
+    camera = Camera("0", 40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    no, ones = np.zeros((30, 40), bool), np.ones((30, 40), np.float32)
+    photo, light = np.full((30, 40, 3), 90, np.uint8), np.ones((30, 40, 3), np.float32)
+    light[:, :20] = 0.9
+    photo[:, :20] = 86  # what nine tenths of the light leave of it
+    photo[10:14], photo[10:14, :20] = 230, 220  # the line
+    across = Witness(camera, photo.copy(), no, no, no, ones)
+    photo[10:14, 20:] = 90
+    shaded = replace(across, photo=photo)
+    monkeypatch.setattr(lifting, "light_in", lambda _, w: arriving_in(w, light))
+    for views, filled in (([across, shaded], 0), ([shaded], 4 * 20)):
+        undone = lifting.lifted_photos(prepared()[1], views)
+        assert [int(dark.sum()) for _, _, dark, _ in undone] == [0] * (len(views) - 1) + [filled]
+        assert (undone[-1][0][10:14, :20] > 225).all()
+
+
+def arriving_in(witness: Witness, light: np.ndarray) -> Arriving:
+    """Light [H, W, 3] on a view that shows nothing but ground."""
+    lit = witness.photo[light.min(-1) == 1].max(-1)
+    whole = slice(0, witness.camera.height), slice(0, witness.camera.width)
+    return Arriving(whole, light, ~witness.hidden, np.bincount(lit, minlength=256))
 
 
 def test_light_is_told_at_more_points_than_opencv_samples_at_once() -> None:
