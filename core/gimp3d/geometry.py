@@ -21,6 +21,7 @@ SAME_DEPTH = 0.02  # relative z within which two drawn depths are the same surfa
 SOLID = 0.9  # opacity from which a pixel shows a surface and not a veil before it
 EVIDENCE_DEPTH = 0.006  # relative z within which a photo shows a completed surface: closer than SAME_DEPTH, as a copied
 # pixel of another surface is seen at once, while one that is not copied is only filled
+FAINT = 1e-3  # of a blur's weight, below which it shows next to nothing
 MOST_ROWS = 32_000  # of a picture that cv2.remap makes; it refuses 32,768
 
 
@@ -120,6 +121,18 @@ def cropped(camera: Camera, window: Window) -> Camera:
 def dilated(mask: np.ndarray, margin: int) -> np.ndarray:
     """[H, W] bool: a mask and all pixels within a square of `margin` pixels round its own."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
+
+
+def blurred(picture: np.ndarray, shown: np.ndarray, sigma: float) -> np.ndarray:
+    """A picture [H, W] or [H, W, C] under a Gaussian blur in which only the pixels shown, [H, W] bool, count, float32.
+
+    Normalised convolution (Knutsson and Westin 1993); 0 where none is near.
+    """
+    each = (..., *[None] * (picture.ndim - 2))  # channel
+    weight = shown.astype(np.float32)
+    total = cv2.GaussianBlur(np.where(shown[each], picture, 0).astype(np.float32), (0, 0), sigma)
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), FAINT)
+    return np.asarray(total.reshape(picture.shape) / share[each])
 
 
 def colours_at(

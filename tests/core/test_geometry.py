@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
@@ -12,6 +13,7 @@ from scenes import cameras, scene
 from gimp3d.camera import Camera
 from gimp3d.compute.jit import exact_kernel
 from gimp3d.geometry import (
+    blurred,
     bounds,
     colours_at,
     cropped,
@@ -117,3 +119,19 @@ def test_an_edge_does_not_tilt_the_normals_beside_it() -> None:
     depth[:, 20:] = 2.0
     found = surface_normals(camera, depth)
     np.testing.assert_allclose(found, np.broadcast_to([0, 0, -1.0], found.shape), atol=1e-9)
+
+
+@pytest.mark.parametrize("channels", [(), (1,), (3,)])
+def test_a_blur_of_what_is_shown_is_the_normalised_convolution(channels: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(3)
+    shown, picture = rng.random((40, 50)) < 0.4, rng.random((40, 50, *channels)).astype(np.float32)
+    shown[:20, :20] = False
+    hidden = np.where(shown[(..., *[None] * len(channels))], picture, np.nan)  # whatever lies there
+    found = blurred(hidden, shown, 1.5)
+    assert found.shape == picture.shape and found.dtype == np.float32 and np.isfinite(found).all()
+    squared = (np.arange(40)[:, None] - 30) ** 2 + (np.arange(50) - 25) ** 2
+    weight = np.exp(-squared / (2 * 1.5**2)) * shown
+    expected = np.tensordot(weight, picture.astype(np.float64), 2) / weight.sum()
+    np.testing.assert_allclose(found[30, 25], expected, rtol=5e-3)
+    assert not found[5, 5].any()  # nothing is shown near
+    np.testing.assert_allclose(blurred(np.ones_like(picture), shown, 1.5)[shown], 1, rtol=1e-5)

@@ -12,7 +12,7 @@ import itertools
 import cv2
 import numpy as np
 
-from ..geometry import bounds
+from ..geometry import blurred, bounds
 from .patchmatch import NearestNeighbourField
 
 FINE, BROAD = 2.0, 4.0  # px, σ of the blurs: that leaves detail out, and whose colours tell where it may lie
@@ -33,8 +33,8 @@ def with_grain(picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field:
     box = bounds(hole, REACH)
     here, laid = hole[box], np.zeros_like(picture[box])
     places, filled = np.argwhere(hole), (picture[box], usable[box] | here)
-    detail, around = picture - _blurred(picture, usable, FINE), _blurred(picture, usable, BROAD)
-    own, own_around = (picture[box] - _blurred(*filled, FINE))[here], _blurred(*filled, BROAD)[here]
+    detail, around = picture - blurred(picture, usable, FINE), blurred(picture, usable, BROAD)
+    own, own_around = (picture[box] - blurred(*filled, FINE))[here], blurred(*filled, BROAD)[here]
     parts = []
     for first in itertools.product((0, WINDOW), (0, WINDOW)):
         weight, (v, u) = _in_windows(usable, field, places, first)
@@ -48,7 +48,7 @@ def with_grain(picture: np.ndarray, hole: np.ndarray, usable: np.ndarray, field:
     grain = (weight * copied).sum(0) / np.sqrt(np.maximum((weight**2).sum(0), LEAST))
     usual = (weight * copied**2).sum((0, 2)) / np.maximum(weight.sum((0, 2)), LEAST)
     laid[here] = grain
-    felt = (laid - _blurred(laid, here, FINE))[here]  # a blur leaves some of it out again
+    felt = (laid - blurred(laid, here, FINE))[here]  # a blur leaves some of it out again
     energies = usual - (own**2).sum(1), (felt**2).sum(1), (own * felt).sum(1)
     lacking, energy, common = (np.maximum(_about(e, here), 0) for e in energies)
     more = (np.sqrt(common**2 + energy * lacking) - common) / np.maximum(energy, LEAST)
@@ -72,13 +72,6 @@ def _in_windows(
     inside = (source >= 0).all(1) & (source < size).all(1)
     weight = np.where(field.found[y, x] & inside & usable[v, u], weight, 0)
     return weight, np.stack([v, u])
-
-
-def _blurred(picture: np.ndarray, shown: np.ndarray, sigma: float) -> np.ndarray:
-    """[H, W, 3]: of the pixels [H, W] bool that are shown."""
-    weight = shown.astype(np.float32)
-    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), sigma)
-    return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)[..., None])
 
 
 def _about(values: np.ndarray, hole: np.ndarray) -> np.ndarray:

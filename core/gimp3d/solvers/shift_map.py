@@ -13,6 +13,7 @@ from numba import float32
 
 from ..compute.jit import exact_kernel, inline_kernel, kernel
 from ..compute.simd import fma16, load16, splat16, sum16
+from ..geometry import blurred
 from .patches import lay_out
 from .patchmatch import NearestNeighbourField
 
@@ -36,10 +37,7 @@ def shift_map(
     costs least: the mean squared difference of source and votes in a window, and along a seam how much the two shifts'
     sources differ on both its sides.
     """
-    known = usable.astype(np.float32)
-    share = np.maximum(cv2.GaussianBlur(known, (0, 0), BLUR), 1e-3)[..., None]
-    sources = cv2.GaussianBlur(picture * known[..., None], (0, 0), BLUR) / share
-    votes = cv2.GaussianBlur(picture, (0, 0), BLUR)
+    sources, votes = blurred(picture, usable, BLUR), cv2.GaussianBlur(picture, (0, 0), BLUR)
     here, found = np.indices(hole.shape), field.found
     shifts = np.where(found, np.stack([field.rows, field.cols]) - here, 0)
     _lower(np.argwhere(hole & found), picture, sources, votes, usable, hole & found, *shifts)

@@ -17,7 +17,7 @@ import numpy as np
 from ..camera import Camera
 from ..compute.jit import exact_kernel, inline_kernel
 from ..compute.threads import parallel_map, run_ranges
-from ..geometry import Window, bounds, cropped, pack_camera, project
+from ..geometry import Window, blurred, bounds, cropped, pack_camera, project
 
 FINE, COARSE = 1.0, 8.0  # px, σ of the two blurs between whose results photos are compared: texture, not light
 LOUDEST = 127  # grey levels beyond which a difference counts no more; kept as int8
@@ -119,13 +119,9 @@ def texture(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
 
     Of a photo [H, W, 3] uint8 only the pixels shown, [H, W] bool, count.
     """
-    grey, weight = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32), shown.astype(np.float32)
-
-    def blurred(sigma: float) -> np.ndarray:
-        total = cv2.GaussianBlur(grey * weight, (0, 0), sigma)
-        return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-
-    return np.clip(np.rint(2 * (blurred(FINE) - blurred(COARSE))), -LOUDEST, LOUDEST).astype(np.int8)
+    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    bands = blurred(grey, shown, FINE) - blurred(grey, shown, COARSE)
+    return np.clip(np.rint(2 * bands), -LOUDEST, LOUDEST).astype(np.int8)
 
 
 @dataclass(frozen=True)
@@ -260,22 +256,16 @@ def _mosaic(
     middle, (spread, loud) = np.zeros((h * w, 3), np.float32), np.zeros((2, h * w), np.float32)
     run_ranges(_agree_range, h * w, samples, textures, density, middle, spread, loud)
     several = (density > 0).sum(0).reshape(h, w) > 1  # one photo agrees with itself
-    spread, loud = (_smooth(a.reshape(h, w, 1), several)[..., 0] for a in (spread, loud))
+    spread, loud = (blurred(a.reshape(h, w), several, SEAM) for a in (spread, loud))
 
     def correction(k: int) -> np.ndarray:
-        off = _smooth((middle - samples[k]).reshape(h, w, 3), told[k])
+        off = blurred((middle - samples[k]).reshape(h, w, 3), told[k], SEAM)
         return np.clip(np.rint(off), -128, 127).astype(np.int8).reshape(-1, 3)
 
     corrections = np.array(parallel_map(correction, range(len(witnesses))))
     picture = middle.copy()
     run_ranges(_choose_range, h * w, samples, corrections, density, middle, FEW, FEW + LOUD * spread.ravel(), picture)
     return np.clip(np.rint(picture), 0, 255).reshape(h, w, 3).astype(np.uint8), spread, loud
-
-
-def _smooth(picture: np.ndarray, shown: np.ndarray) -> np.ndarray:
-    weight = shown.astype(np.float32)
-    total = cv2.GaussianBlur(picture * weight[..., None], (0, 0), SEAM).reshape(picture.shape)
-    return total / np.maximum(cv2.GaussianBlur(weight, (0, 0), SEAM), 1e-3)[..., None]
 
 
 @exact_kernel

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput
+from ..geometry import blurred
 from ..priors.calls import Call, Painter
 from ..priors.pasting import paste_picture, resized, scaled, window_round_hole
 from ..run import ViewState
@@ -104,9 +105,7 @@ def refine_view(who: Painter, view: ViewState, mask: np.ndarray, seed: int, call
         pasted = paste_picture(painted, mask, right, f"the answer of {who.who}")
         if pasted.warnings:
             raise BadInput(pasted.warnings[0])
-        inside = mask.astype(np.float32)[..., None]  # under a blur that looks at the mask alone
-        weight = np.maximum(cv2.GaussianBlur(inside, (0, 0), COARSE), 1e-6)[..., None]
-        off = cv2.GaussianBlur((pasted.image.astype(np.float32) - painted) * inside, (0, 0), COARSE) / weight
+        off = blurred(pasted.image.astype(np.float32) - painted, mask, COARSE)
         drift = float(np.abs(off)[mask].mean())
         words = f"{drift:.0f} grey levels from what was propagated"
         if drift > MOST_DRIFT:

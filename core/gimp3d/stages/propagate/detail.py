@@ -10,9 +10,11 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from ...geometry import blurred
+
 BLURS = (0.6, 1.2, 2.4, 4.8)  # px, σ of the blurs between whose results the bands of detail lie
 ROUND = 24  # px round the hole in which photo and scene are compared
-FAINT = 1e-3  # of a blur's weight
+FAINT = 1e-3  # squared grey levels of a band in which there is nothing
 
 
 def as_drawn(
@@ -39,11 +41,8 @@ def as_drawn(
 
 def _bands(picture: np.ndarray, where: np.ndarray) -> Iterator[np.ndarray]:
     """Differences of a picture's blurs, from fine to coarse; only what is known of it counts."""
-    each = (..., *[None] * (picture.ndim - 2))  # channel
-    weight, known = where.astype(np.float32), np.where(where[each], picture, 0)
-    finer = known
+    finer = picture
     for sigma in BLURS:
-        share = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), FAINT)
-        coarser = cv2.GaussianBlur(known, (0, 0), sigma) / share[each]
+        coarser = blurred(picture, where, sigma)
         yield finer - coarser
         finer = coarser
