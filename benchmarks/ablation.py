@@ -108,9 +108,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:depth_scatter", lambda *_: np.inf),
     ),
     "a plane must hold a tenth of what is round the object": (("charts.least", 0.1),),
-    "planes stay where their own pixels settled": (
-        ("gimp3d.stages.charts.find:_best_known", lambda claim, plane, best, *_: (best, plane)),
-    ),
     "views' agreement asks no more of photos": (("gimp3d.stages.masks:USUAL_AGREEMENT", 0.0),),
     "no haze is cleared": (("gimp3d.stages.clearing:HAZE_WEIGHT", math.inf),),
     "half of a Gaussian is to be seen in a photo": (("clearing.observed", 0.5),),

@@ -388,18 +388,6 @@ def test_a_surface_does_not_begin_anew_where_it_goes_through_another_one() -> No
     assert tolerance[False] < 0.5 * tolerance[True]
 
 
-def test_pixels_that_settled_elsewhere_join_the_surface_that_they_show_better(floor_room: Room) -> None:
-    floor = Plane.make(np.zeros(3), UP, REGION)
-    guess = floor.tilted(0.1, np.tan(np.radians(8)), 0)
-    textures = Textures.make(floor_room.witnesses)
-    around = find._surface_round(floor_room.witnesses, REGION)
-    claim = find._Claim(guess, around, [], floor_room.witnesses, extent(REGION))
-    elsewhere = claim.agreement(textures)(np.zeros(3))
-    agreement, plane = find._best_known(claim, guess, elsewhere, [guess, floor], textures)
-    assert agreement > 2 * elsewhere and plane.normal @ UP > np.cos(np.radians(0.2))
-    assert find._best_known(claim, floor, agreement, [floor, guess], textures) == (agreement, floor)
-
-
 def test_a_claim_s_pose_leads_to_the_plane() -> None:
     plane = Plane.make(np.array([1.0, 2, 0.02]), SLANT[0], REGION)
     claim = find._Claim(plane, find.Beside(*np.zeros((2, 0, 3)), np.zeros(0)), [], [], 0.7)

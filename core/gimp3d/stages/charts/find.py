@@ -137,10 +137,7 @@ def find_planes(
     levels = [Textures.make(witnesses, shrink=shrink) for shrink in LEVELS]
     textures = levels[-1]
     claims = [_Claim(plane, own, _bounds(plane, own, all_planes), witnesses, diagonal) for plane, own in sought]
-    settled_at = [_settled(claim, levels) for claim in claims]
-    known = [plane for _, plane in settled_at]
-    found = [(*_best_known(c, plane, best, known, textures), c) for c, (best, plane) in zip(claims, settled_at)]
-    found.sort(key=lambda f: -f[0])
+    found = sorted(((*_settled(claim, levels), claim) for claim in claims), key=lambda f: -f[0])
     kept = _kept([(plane, claim) for _, plane, claim in found], textures, settings)
     for _ in range(SHARED if len(kept) > 1 else 0):
         kept = _kept(_settled_by_own_pixels(kept, textures), textures, settings)
@@ -287,16 +284,6 @@ def _settled(claim: _Claim, levels: Sequence[Textures]) -> tuple[float, Plane]:
         best, at = max((_climbed(agreement, start, least) for start in starts), key=lambda climbed: climbed[0])
         reached, near = [at], claim.at(at)
     return best, claim.at(reached[0]) if best > 0 else claim.plane
-
-
-def _best_known(
-    claim: _Claim, plane: Plane, best: float, known: Sequence[Plane], textures: Textures
-) -> tuple[float, Plane]:
-    """Where photos agree better still: climbed from where other claims settled, of one surface that looked like two."""
-    agreement = claim.agreement(textures, near=plane)
-    starts = [claim.pose_of(p) for p in known if p is not plane and not p.crosses(claim.plane)]
-    found = [_climbed(agreement, s, FINE_STEP) for s in _best_of(agreement, starts, 1) if agreement(s) > best]
-    return (found[0][0], claim.at(found[0][1])) if found else (best, plane)
 
 
 def _settled_by_own_pixels(found: Sequence[tuple[Plane, _Claim]], textures: Textures) -> list[tuple[Plane, _Claim]]:
