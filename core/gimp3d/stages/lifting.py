@@ -90,7 +90,7 @@ def lift(
 def lifted_photos(shadow: Shadow, witnesses: Sequence[Witness]) -> list[Undone]:
     """Of each view: the photo without the shadow.
 
-    How bright lit ground is all views tell: one may show a white line's lifted part alone.
+    How bright lit ground is, all views tell: one may show of a white line nothing but what lies in the shade.
     """
     arriving = parallel_map(lambda w: light_in(shadow, w), witnesses)
     levels = np.cumsum(sum(a.lit for a in arriving))
