@@ -31,6 +31,7 @@ LEVELS = (4, 2, 1)  # by which pictures are shrunk in which a plane is settled
 POINTS = 96  # along a side, at which photos are compared at the finest level …
 OWN = 4  # … and one for so many of these that led to the plane: more of them tilt it (two planes on real_bed)
 SHARED = 2  # times that planes are settled again, each by its own pixels of photos
+MADE_UP = 0.5  # agreement of photos on a plane, over that where splats draw its pixels, below which it is none
 ABOUT = 2.0  # of these points, σ of the neighbourhood by which such pixels are told
 ONE_SIDED = 0.9  # share of a plane's points that lie on one side of another one if it ends there
 SEARCH, SWEEP = 0.12, 25  # diagonals along its normal in which a plane is sought, and offsets that are tried
@@ -115,7 +116,8 @@ def find_planes(
     hidden always. Planes are then settled where photos' textures agree best, as rough splats' depths do not tell: at
     the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
     painted on those. Of two planes that could both be what some pixels show photos choose as well, and where several
-    stay, each is settled again by the pixels that show it. Fewer than three photos cannot judge: the planes are as they
+    stay, each is settled again by the pixels that show it, and a further one on which they agree far less than where
+    splats draw them is none. Fewer than three photos cannot judge: the planes are as they
     are drawn then.
     """
     diagonal, cameras = extent(region), np.array([w.camera.centre for w in witnesses])
@@ -141,6 +143,7 @@ def find_planes(
     kept = _kept([(plane, claim) for _, plane, claim in found], textures, settings)
     for _ in range(SHARED if len(kept) > 1 else 0):
         kept = _kept(_settled_by_own_pixels(kept, textures), textures, settings)
+    kept = [(plane, claim) for k, (plane, claim) in enumerate(kept) if k == 0 or not _made_up(plane, claim, textures)]
     return tuple(replace(plane, told=claim.own.some(SURFACE).on(plane)) for plane, claim in kept)
 
 
@@ -155,6 +158,13 @@ def _kept(
         if not kept or 1 - textures.agreement(claim.own.on(plane), free) < settings.relief * (1 - before):
             kept.append((plane, claim))
     return kept
+
+
+def _made_up(plane: Plane, claim: _Claim, textures: Textures) -> bool:
+    """What is drawn near it is rather the truth, such as of a table's end, its legs, and the floor between them."""
+    drawn = claim.own.points
+    free = _free(drawn, textures)
+    return textures.agreement(claim.own.on(plane), free) < MADE_UP * textures.agreement(drawn, free)
 
 
 def depth_scatter(points: np.ndarray, witnesses: Sequence[Witness]) -> float:
