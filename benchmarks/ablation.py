@@ -104,6 +104,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
         ("gimp3d.stages.charts.find:ONE_SIDED", 2.0),
     ),
     "planes are settled by pixels of other planes, too": (("gimp3d.stages.charts.find:SHARED", 0),),
+    "planes stay on which photos agree far less than where splats draw them": (
+        ("gimp3d.stages.charts.find:MADE_UP", 0.0),
+    ),
     "planes are settled where views see through them, too": (
         ("gimp3d.stages.charts.find:depth_scatter", lambda *_: np.inf),
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -225,6 +226,20 @@ def test_a_wall_without_much_texture_is_not_tilted_towards_a_floor_with_more() -
     assert len(planes) == 2
     for normal, _ in (FLOOR, WALL):
         assert max(p.normal @ normal for p in planes) > np.cos(np.radians(1.5))
+
+
+def test_a_further_plane_that_photos_deny_is_none(floor_room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One of a table's end, its legs and the floor between them: where splats draw them, photos agree."""
+    kept, slope = find._kept, np.tan(np.radians(16))
+    monkeypatch.setattr(find, "SHARED", 0)
+    for tilt, stays in (((slope, 0.0), False), ((0.0, -slope), False), ((0.0, 0.0), True)):
+
+        def with_another(*of: Any, tilt: tuple[float, float] = tilt) -> Any:
+            first, claim = kept(*of)[0]
+            return [(first, claim), (first.tilted(0, *tilt), claim)]
+
+        monkeypatch.setattr(find, "_kept", with_another)
+        assert len(find_planes(floor_room.witnesses, REGION)) == 1 + stays
 
 
 def test_a_floor_among_things_that_hide_most_of_it_is_told_by_the_photos_that_show_it() -> None:
