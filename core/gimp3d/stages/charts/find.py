@@ -117,8 +117,7 @@ def find_planes(
     the pixels that led to them, and round the object on their side of the others, or they would tilt towards what is
     painted on those. Of two planes that could both be what some pixels show photos choose as well, and where several
     stay, each is settled again by the pixels that show it, and a further one on which they agree far less than where
-    splats draw them is none. Fewer than three photos cannot judge: the planes are as they
-    are drawn then.
+    splats draw them is none. Fewer than three photos cannot judge: the planes are as they are drawn then.
     """
     diagonal, cameras = extent(region), np.array([w.camera.centre for w in witnesses])
     left, rng = _surface_round(witnesses, region), np.random.default_rng(0)
