@@ -51,6 +51,14 @@ def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
     return (hits.depth > 0) & (np.abs(witness.depth - hits.depth) < 0.05 * hits.depth)
 
 
+def _all_alike(shown_beside: Any) -> Any:
+    def shown(*of: Any) -> Any:
+        found = shown_beside(*of)
+        return found._replace(alike=found.beside)
+
+    return shown
+
+
 def _scatter_of_all(points: np.ndarray, witnesses: Any) -> float:
     off = np.abs(find._depths_off(points, witnesses))
     return min(MOST_SCATTER, find.SCATTER * float(np.median(off))) if len(off) else 0.0
@@ -127,6 +135,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "what was left is not asked": (("gimp3d.steps.behind:LEFT", ()),),
     "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),
     "photos are cut at their own size": (("gimp3d.stages.beside:ROUNDS", (1, 1)),),
+    "what photos show beside the object may be a foot, whatever its colours": (
+        ("gimp3d.steps.behind:shown_beside", Around(_all_alike)),
+    ),
     "a twentieth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.05),),
     "a quarter of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.25),),
     "charts take colours where a foot may be": (

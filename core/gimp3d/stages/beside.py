@@ -26,8 +26,9 @@ PURE = 0.7  # share from which a pixel has nobody else's colour
 LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's, too
 SOME = 0.25  # share from which the next round begins with it as the object's
 MARGIN = 12  # px round the boxes whose colours are the surroundings' for certain
+LEAST_VARIANCE = 1e-3  # squared grey levels, added to what a mixture's colours vary by: one may be even
 LARGEST = 512  # px, longest side of what is cut at once: colours need no more
-ELSE, OBJECT = 1, 2  # labels of a view's pixels
+ELSE, OBJECT, ALIKE = 1, 2, 3  # labels of a view's pixels; alike: it is cut off, and yet has the object's colours
 
 
 class Sight(NamedTuple):
@@ -45,6 +46,7 @@ class Shown(NamedTuple):
     beside: np.ndarray  # beside the object, of those that may be surroundings
     object_: np.ndarray  # as the object, of those in the boxes that yet would be left
     both: np.ndarray  # of both: more beside the object than not, yet some of it
+    alike: np.ndarray  # beside the object, yet some of it in colours that are rather the object's: it may be a foot
     share: np.ndarray  # [N] of the weight that is shown, that on the object
     photos: list[tuple[Camera, np.ndarray]]  # and where photos show what is beside the object, [H, W] bool
 
@@ -57,7 +59,8 @@ def shown_beside(
 
     Each photo is cut by its colours into the object and the rest (GrabCut, Rother et al. 2004): of what `goes`, as it
     is drawn there, what may be nothing else is the object's for certain. Once more, from what in the boxes all photos
-    show as the object's to some share: so they tell each other.
+    show as the object's to some share: so they tell each other. What a cut takes off hangs together; of thin feet that
+    stand on what looks much like them single pixels tell.
     """
     begins, sure, in_boxes = goes, goes & ~may, goes | stays
     sights = [sight for sight in sights if sight.polygon.any()]
@@ -74,13 +77,17 @@ def shown_beside(
         start[sight.polygon & certain] = cv2.GC_FGD
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)
-        labels = np.where(sight.marked, OBJECT, ELSE).astype(np.uint8)
-        labels[window][_cut(sight.photo[window], start[window], size)] = OBJECT
-        clear[k] = labels == ELSE
-        return label_weights(scene, sight.camera, labels, OBJECT, in_boxes | may)
+        labels = np.full(sight.polygon.shape, ELSE, np.uint8)
+        cut, alike = _cut(sight.photo[window], start[window], size)
+        labels[window][alike & sight.polygon[window]] = ALIKE
+        labels[window][cut] = OBJECT
+        labels[sight.marked] = OBJECT
+        clear[k] = labels != OBJECT
+        return label_weights(scene, sight.camera, labels, ALIKE, in_boxes | may)
 
     for size in ROUNDS:
-        elsewhere, on_object = total_over(range(len(sights)), partial(of, size), (OBJECT, len(scene)))
+        unlike, on_object, alike = total_over(range(len(sights)), partial(of, size), (ALIKE, len(scene)))
+        elsewhere = unlike + alike
         shown = elsewhere + on_object
         sure = sure | (in_boxes & (on_object > MOSTLY * shown))
         begins = in_boxes & (on_object > SOME * shown)
@@ -89,7 +96,8 @@ def shown_beside(
     told, some, mostly = shown > LEAST_WEIGHT, share > LEAST, share > MOSTLY
     both = ((goes & may) | stays) & told & some & ~mostly
     photos = [(s.camera, beside) for s, beside in zip(sights, clear)]
-    return Shown(may & told & ~some, stays & told & mostly, both, share, photos)
+    found = may & told & ~some
+    return Shown(found, stays & told & mostly, both, found & (on_object + alike > LEAST * shown), share, photos)
 
 
 def _window(polygon: np.ndarray) -> Window:
@@ -98,14 +106,29 @@ def _window(polygon: np.ndarray) -> Window:
     return slice(max(0, top - MARGIN), bottom + 1 + MARGIN), slice(max(0, left - MARGIN), right + 1 + MARGIN)
 
 
-def _cut(photo: np.ndarray, start: np.ndarray, times: float) -> np.ndarray:
-    """[h, w] bool: what is the object's by its colours; `start` as GrabCut names it."""
+def _cut(photo: np.ndarray, start: np.ndarray, times: float) -> tuple[np.ndarray, np.ndarray]:
+    """[h, w] bool each: what is the object's by its colours and hangs together, and pixels whose colours are rather the
+    object's; `start` as GrabCut names it."""
     times = min(times, LARGEST / max(start.shape))
     size = [max(1, round(n * times)) for n in start.shape[::-1]]
     labels = cv2.resize(start, size, interpolation=cv2.INTER_NEAREST)
+    alike = np.zeros(start.shape, bool)
     if len(np.unique(labels & 1)) == 2:
         background, foreground = np.zeros((2, 1, 65))
         cv2.setRNGSeed(0)  # of this thread: what k-means begins with
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR)
         cv2.grabCut(small, labels, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)
-    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        alike = _likelihood(photo, foreground[0]) > _likelihood(photo, background[0])
+    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0, alike
+
+
+def _likelihood(photo: np.ndarray, mixture: np.ndarray) -> np.ndarray:
+    """[h, w] of the colours in one of GrabCut's mixtures of five Gaussians, but for a factor."""
+    total = np.zeros(photo.shape[:2], np.float32)
+    weights, means, covariances = np.split(mixture, [5, 20])
+    for weight, mean, covariance in zip(weights, means.reshape(5, 3), covariances.reshape(5, 3, 3)):
+        if weight > 0:
+            whitening = np.linalg.inv(np.linalg.cholesky(covariance + LEAST_VARIANCE * np.eye(3)))
+            off = cv2.transform(photo.astype(np.float32), np.column_stack([whitening, -whitening @ mean]))
+            total += weight * np.linalg.det(whitening) * np.exp(-0.5 * (off**2).sum(-1))
+    return total

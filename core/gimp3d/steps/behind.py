@@ -75,7 +75,7 @@ class Surfaces:
     split: np.ndarray  # [M] of its rows, that are the surroundings' parts
 
     def witnesses(self, views: Sequence[ViewState], wary: bool = False) -> list[Witness]:
-        """The views; with `wary`, of nothing that may be a foot: its colours do not tell it from a fold."""
+        """The views; with `wary`, of nothing that may be a foot: some of it has the object's colours."""
         found = []
         for v, (hidden, beside), marked in zip(views, self.doubtful if wary else self.objects, self.marked):
             veiled = (v.masks.alpha_before < SOLID) | v.masks.occluder
@@ -137,7 +137,7 @@ def _as_photos_show(
         scene = scene.with_rows(split, rest).extended(parts)
     more = np.zeros(len(split), bool)
     selection = Selection(np.append(fates, np.full(len(split), np.uint8(Fate.REMOVED_STRADDLING))))
-    wary = selection.removed | np.append(back & ~sunk, more)
+    wary = selection.removed | np.append(back & (shown.alike | (both & ~sunk)), more)
     objects, doubtful = (
         object_pixels(scene, rows, masks.views, settings.clearing) for rows in (selection.removed, wary)
     )

@@ -69,7 +69,7 @@ def test_of_many_photos_some_are_cut_by_their_colours_as_far_apart_as_can_be(mon
 
     def shown(scene: Gaussians, goes: np.ndarray, stays: np.ndarray, may: np.ndarray, sights: list[Sight]) -> Shown:
         asked.append(sights)
-        return Shown(*np.zeros((3, len(scene)), bool), np.zeros(len(scene)), [])
+        return Shown(*np.zeros((4, len(scene)), bool), np.zeros(len(scene)), [])
 
     monkeypatch.setattr("gimp3d.steps.behind.shown_beside", shown)
     monkeypatch.setattr("gimp3d.steps.behind.CUT", 3)
