@@ -22,7 +22,7 @@ from ..compute.threads import run_ranges
 from ..gaussians import Gaussians
 from . import cpu
 from .bin import TileLists
-from .project import BLUE, RED
+from .project import RED
 from .staging import rotation, to_camera
 from .types import Mask, RasterSettings, Rendering
 
@@ -66,13 +66,20 @@ class Drawing:
 
     def footprint(self, chosen: np.ndarray) -> np.ndarray:
         """As `footprint`; only for drawings without colours."""
-        if chosen.shape != (len(self.gaussians),):
-            raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {chosen.shape}")
+        return self.footprints(chosen)[0]
+
+    def footprints(self, *chosen: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Those of up to three sets, at the cost of one."""
+        for one in chosen:
+            if one.shape != (len(self.gaussians),):
+                raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {one.shape}")
         if self.with_colour:
             raise ValueError("footprint: this drawing has colours; make one without")
-        _paint(self._made.lists.entries, chosen, self._made.features)
+        for channel, one in enumerate((*chosen, *[chosen[-1]] * (3 - len(chosen)))):
+            _paint(self._made.lists.entries, one, RED + channel, self._made.features)
         black = replace(self._made.settings, background=(0.0, 0.0, 0.0))
-        return np.ascontiguousarray(self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb[..., 0])
+        rgb = self._draw(cpu.pass_flags(frozenset({"rgb"})), settings=black).rgb
+        return tuple(np.ascontiguousarray(rgb[..., k]) for k in range(len(chosen)))
 
     def _draw(self, flags: cpu.Flags, **changed: Any) -> Rendering:
         return cpu.blend(replace(self._made, flags=flags, **changed), keep=False)[0]
@@ -86,11 +93,10 @@ def _without(lists: TileLists, gone: np.ndarray) -> TileLists:
 
 
 @exact_kernel
-def _paint(entries, chosen, features):
-    """The listed Gaussians white if they are chosen, else black."""
+def _paint(entries, chosen, channel, features):
+    """A channel of the listed Gaussians: 1 if they are chosen, else 0."""
     for k in range(len(entries)):
-        for channel in range(RED, BLUE + 1):
-            features[entries[k], channel] = 1.0 if chosen[entries[k]] else 0.0
+        features[entries[k], channel] = 1.0 if chosen[entries[k]] else 0.0
 
 
 @exact_kernel

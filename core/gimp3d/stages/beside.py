@@ -70,10 +70,11 @@ def shown_beside(
     def of(size: float, k: int) -> np.ndarray:
         sight = sights[k]
         drawn = drawing(scene, sight.camera, with_colour=False, pixels=sight.polygon)
-        certain = cv2.erode((drawn.footprint(sure) > PURE).astype(np.uint8), np.ones((3, 3))) > 0
+        surely, about = drawn.footprints(sure, begins)
+        certain = cv2.erode((surely > PURE).astype(np.uint8), np.ones((3, 3))) > 0
         start = np.full(sight.polygon.shape, cv2.GC_BGD, np.uint8)
         start[sight.polygon] = cv2.GC_PR_BGD
-        start[sight.polygon & (drawn.footprint(begins) > MOSTLY)] = cv2.GC_PR_FGD
+        start[sight.polygon & (about > MOSTLY)] = cv2.GC_PR_FGD
         start[sight.polygon & certain] = cv2.GC_FGD
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)

@@ -12,7 +12,7 @@ from ..box import Region
 from ..compute.threads import parallel_map
 from ..gaussians import Gaussians
 from ..geometry import dilated, framed, window_mask
-from ..raster import drawing, footprint, label_weights, touched_window
+from ..raster import drawing, label_weights, touched_window
 from ..schema import Share
 from .charts import Chart, Hits, Laid, extent, first_hits
 from .masks import ViewMasks
@@ -40,16 +40,17 @@ class ClearingSettings:
 
 
 def object_pixels(
-    scene: Gaussians, removed: np.ndarray, views: Sequence[ViewMasks], settings: ClearingSettings
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """What each photo shows of some removed Gaussians, [N] bool; see pixels_of."""
-    gone = scene.take(removed)
+    scene: Gaussians, views: Sequence[ViewMasks], settings: ClearingSettings, *sets: np.ndarray
+) -> tuple[Sequence[tuple[np.ndarray, np.ndarray]], ...]:
+    """What each photo shows of removed Gaussians, for each of up to three sets, [N] bool; see pixels_of."""
+    gone = scene.take(np.logical_or.reduce(sets))
 
-    def of(view: ViewMasks) -> tuple[np.ndarray, np.ndarray]:
+    def of(view: ViewMasks) -> list[tuple[np.ndarray, np.ndarray]]:
         window = window_mask(touched_window(gone, view.camera), view.camera)
-        return pixels_of(footprint(scene, view.camera, removed, pixels=window), settings)
+        drawn = drawing(scene, view.camera, with_colour=False, pixels=window)
+        return [pixels_of(weight, settings) for weight in drawn.footprints(*sets)]
 
-    return parallel_map(of, views)
+    return tuple(zip(*parallel_map(of, views)))
 
 
 def pixels_of(weight: np.ndarray, settings: ClearingSettings) -> tuple[np.ndarray, np.ndarray]:

@@ -138,9 +138,7 @@ def _as_photos_show(
     more = np.zeros(len(split), bool)
     selection = Selection(np.append(fates, np.full(len(split), np.uint8(Fate.REMOVED_STRADDLING))))
     wary = selection.removed | np.append(back & (shown.alike | (both & ~sunk)), more)
-    objects, doubtful = (
-        object_pixels(scene, rows, masks.views, settings.clearing) for rows in (selection.removed, wary)
-    )
+    objects, doubtful = object_pixels(scene, masks.views, settings.clearing, selection.removed, wary)
     reason = f"{found.reason}, {int((back & ~both).sum())} Gaussians are shown beside it and stay, {gone} as it and go"
     reason += f", {len(split)} are both and split"
     found = replace(found, selection=selection, objects=objects, doubtful=doubtful, reason=reason)

@@ -56,6 +56,16 @@ def test_what_is_gone_might_never_have_been_there(seed: int, surfels: bool) -> N
         np.testing.assert_array_equal(a, b)
 
 
+def test_up_to_three_footprints_at_once() -> None:
+    gaussians = random_scene(5, 200, 0)
+    sets = np.random.default_rng(5).random((3, len(gaussians))) < 0.4
+    for some in (sets, sets[:2], sets[:1]):
+        for found, chosen in zip(drawing(gaussians, WIDE, with_colour=False).footprints(*some), some, strict=True):
+            np.testing.assert_array_equal(found, footprint(gaussians, WIDE, chosen))
+    with pytest.raises(ValueError, match="expected shape"):
+        drawing(gaussians, WIDE, with_colour=False).footprints(sets[0], sets[1, :-1])
+
+
 def test_one_way_of_drawing_does_not_disturb_the_others() -> None:
     gaussians, pixels = random_scene(3, 200, 2), np.zeros((WIDE.height, WIDE.width), bool)
     pixels[20:50, 30:90] = True

@@ -63,7 +63,7 @@ def removal(extra: Gaussians | None = None) -> Removal:
         no = np.zeros(depth.shape, bool)
         views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha, no))
     selection = Selection(fates)
-    masks = object_pixels(whole, selection.removed, views, ClearingSettings())
+    (masks,) = object_pixels(whole, views, ClearingSettings(), selection.removed)
     grey, witnesses = np.full(3, 99, np.uint8), []
     for v, (shown, some) in zip(views, masks):
         photo = np.where(shown[..., None], RED, grey)

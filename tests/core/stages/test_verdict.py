@@ -67,7 +67,7 @@ def case(whole: Gaussians) -> Case:
         no = np.zeros(depth.shape, bool)
         views.append(ViewMasks(camera, no, no, no, no, depth, alpha, depth, alpha, no))
     selection = Selection(np.where(removed, Fate.REMOVED_INSIDE, Fate.OUTSIDE).astype(np.uint8))
-    pixels = object_pixels(whole, removed, views, ClearingSettings())
+    (pixels,) = object_pixels(whole, views, ClearingSettings(), removed)
     witnesses = [
         Witness(v.camera, photos[v.camera.id], *objects, v.alpha_before < SOLID, v.depth_before)
         for v, objects in zip(views, pixels)
