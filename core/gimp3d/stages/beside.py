@@ -58,14 +58,14 @@ def shown_beside(
     boxes; all [N] bool.
 
     Each photo is cut by its colours into the object and the rest (GrabCut, Rother et al. 2004): of what `goes`, as it
-    is drawn there, what may be nothing else is the object's for certain. Once more, from what in the boxes all photos
-    show as the object's to some share: so they tell each other. What a cut takes off hangs together; of thin feet that
-    stand on what looks much like them single pixels tell.
+    is drawn there, what may be nothing else is the object's for certain. Once more, larger and with the colours found,
+    from what in the boxes all photos show as the object's to some share: so they tell each other. What a cut takes off
+    hangs together; of thin feet that stand on what looks much like them single pixels tell.
     """
     begins, sure, in_boxes = goes, goes & ~may, goes | stays
     sights = [sight for sight in sights if sight.polygon.any()]
     elsewhere, on_object = np.zeros((2, len(scene)))
-    clear = [s.polygon for s in sights]
+    clear, mixtures = [s.polygon for s in sights], np.zeros((len(sights), 2, 1, 65))
 
     def of(size: float, k: int) -> np.ndarray:
         sight = sights[k]
@@ -79,8 +79,9 @@ def shown_beside(
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)
         labels = np.full(sight.polygon.shape, ELSE, np.uint8)
-        cut, alike = _cut(sight.photo[window], start[window], size)
-        labels[window][alike & sight.polygon[window]] = ALIKE
+        cut = _cut(sight.photo[window], start[window], size, mixtures[k])
+        if size == ROUNDS[-1]:
+            labels[window][_alike(sight.photo[window], mixtures[k]) & sight.polygon[window]] = ALIKE
         labels[window][cut] = OBJECT
         labels[sight.marked] = OBJECT
         clear[k] = labels != OBJECT
@@ -107,20 +108,27 @@ def _window(polygon: np.ndarray) -> Window:
     return slice(max(0, top - MARGIN), bottom + 1 + MARGIN), slice(max(0, left - MARGIN), right + 1 + MARGIN)
 
 
-def _cut(photo: np.ndarray, start: np.ndarray, times: float) -> tuple[np.ndarray, np.ndarray]:
-    """[h, w] bool each: what is the object's by its colours and hangs together, and pixels whose colours are rather the
-    object's; `start` as GrabCut names it."""
+def _cut(photo: np.ndarray, start: np.ndarray, times: float, mixtures: np.ndarray) -> np.ndarray:
+    """[h, w] bool: what is the object's by its colours and hangs together.
+
+    `start` as GrabCut names it; `mixtures` [2, 1, 65], its background's and foreground's, in and out: it goes on from
+    them, or begins with k-means where they are 0.
+    """
     times = min(times, LARGEST / max(start.shape))
     size = [max(1, round(n * times)) for n in start.shape[::-1]]
     labels = cv2.resize(start, size, interpolation=cv2.INTER_NEAREST)
-    alike = np.zeros(start.shape, bool)
     if len(np.unique(labels & 1)) == 2:
-        background, foreground = np.zeros((2, 1, 65))
+        mode = cv2.GC_EVAL if mixtures.any() else cv2.GC_INIT_WITH_MASK
         cv2.setRNGSeed(0)  # of this thread: what k-means begins with
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR)
-        cv2.grabCut(small, labels, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)
-        alike = _likelihood(photo, foreground[0]) > _likelihood(photo, background[0])
-    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0, alike
+        cv2.grabCut(small, labels, None, mixtures[0], mixtures[1], 1, mode)
+    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _alike(photo: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
+    """[h, w] bool: pixels whose colours are rather the object's."""
+    elsewhere, object_ = (_likelihood(photo, mixture[0]) for mixture in mixtures)
+    return object_ > elsewhere
 
 
 def _likelihood(photo: np.ndarray, mixture: np.ndarray) -> np.ndarray:
