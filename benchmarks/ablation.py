@@ -143,6 +143,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "charts take colours where a foot may be": (
         ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
+    "a texel that no photo shows is a hole": (("gimp3d.stages.charts:SPECK", 0),),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "what the object hides lies on planes": (

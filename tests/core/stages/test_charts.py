@@ -722,6 +722,33 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     assert rests[12:18, 37:44].sum() == 1
 
 
+@pytest.mark.parametrize(("reach", "is_hole"), [(0, False), (5, True)])
+def test_a_speck_that_no_photo_shows_is_no_hole(
+    reach: int, is_hole: bool, floor_room: Room, floor_chart: Chart
+) -> None:
+    """Apart from the hole: a texel, and a spot of many."""
+    row, col = 8, floor_chart.hole.shape[1] // 2
+    spot = np.zeros(floor_chart.hole.shape, bool)
+    spot[row - reach : row + reach + 1, col - reach : col + reach + 1] = True
+    assert floor_chart.known[spot].all()
+
+    def with_spot(witness: Witness) -> Witness:
+        uv, _ = witness.camera.project(texels(floor_chart)[spot.ravel()])
+        rows, cols = np.floor(uv[:, ::-1]).astype(int).T
+        on = np.zeros(witness.hidden.shape, np.uint8)
+        on[rows, cols] = 1
+        covered = cv2.morphologyEx(on, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+        photo = np.where(covered[..., None], np.uint8([200, 20, 20]), witness.photo)
+        return replace(witness, hidden=witness.hidden | covered, photo=photo)
+
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], [with_spot(w) for w in floor_room.witnesses])
+    place = texels(floor_chart).reshape(*spot.shape, 3)[row, col]
+    col, row = np.floor(chart.camera.project(place)[0]).astype(int)  # the spot may have widened the chart
+    assert chart.hole[row, col] == is_hole and not chart.known[row, col] and chart.there[row, col]
+    if not is_hole:
+        np.testing.assert_allclose(chart.image[row, col], texture(place), atol=10)
+
+
 def test_the_object_hides_from_most_what_fewer_photos_show_or_have_something_else_before() -> None:
     def hides(hiding: int, photos: int, behind: int) -> bool:
         said = [Says.HIDDEN] * hiding + [Says.SEEN] * photos + [Says.BEHIND] * behind + [Says.NOTHING]

@@ -16,7 +16,7 @@ import scipy.ndimage
 
 from ...box import Region, in_region
 from ...compute.threads import parallel_map
-from ...geometry import dilated, framed
+from ...geometry import blurred, dilated, framed
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import MOST_SCATTER, TOLERANCE, ChartSettings, depth_scatter
@@ -41,6 +41,7 @@ VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is the
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
+SPECK = 4  # texels; smaller parts of a hole are none
 MIXED = 2  # texels round the object whose pixels show some of it
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
@@ -177,18 +178,26 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Ch
     colours = _object_colours(laid.plane, witnesses, tolerance)
     inside = in_region(region, points.reshape(-1, 3)).reshape(laid.depth.shape)
     rests, foreign = _told_by_colours(shown, colours, inside)
-    hole = shown.hole | rests
+    hole, specks = _compact(shown.hole | rests)
+    image = np.where(specks[..., None], blurred(shown.image, ~(hole | specks), 1.0), shown.image).astype(np.uint8)
     chart = Chart(
         **vars(laid),
         there=shown.there,
-        image=np.where(hole[..., None], np.uint8(0), shown.image),
-        known=shown.known & ~hole & ~foreign,
+        image=np.where(hole[..., None], np.uint8(0), image),
+        known=shown.known & ~hole & ~specks & ~foreign,
         hole=hole,
         photos=shown.photos,
         scatter=scatter,
         tolerance=tolerance,
     )
     return chart, shown.spread
+
+
+def _compact(hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool each: the hole without specks, and specks: where photos err, as what they show hangs together."""
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
+    large = hole & (parts[labels, cv2.CC_STAT_AREA] > SPECK)
+    return large, hole & ~large
 
 
 def _placed(
