@@ -23,7 +23,7 @@ from .witness import total_over
 ROUNDS = 1, 2  # times a photo's size at which it is cut, from what the round before found in all; larger cuts lose less
 MOSTLY = 0.5  # share of blend weight in a pixel that decides: the majority
 PURE = 0.7  # share from which a pixel has nobody else's colour
-LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's, too
+LEAST = 0.1  # share of a Gaussian's weight that must be the object's for it to be the object's, too, or in its colours
 SOME = 0.25  # share from which the next round begins with it as the object's
 MARGIN = 12  # px round the boxes whose colours are the surroundings' for certain
 LEAST_VARIANCE = 1e-3  # squared grey levels, added to what a mixture's colours vary by: one may be even
@@ -46,7 +46,7 @@ class Shown(NamedTuple):
     beside: np.ndarray  # beside the object, of those that may be surroundings
     object_: np.ndarray  # as the object, of those in the boxes that yet would be left
     both: np.ndarray  # of both: more beside the object than not, yet some of it
-    alike: np.ndarray  # beside the object, yet some of it in colours that are rather the object's: it may be a foot
+    alike: np.ndarray  # of what is beside or both: beside the object in colours that are rather its: it may be a foot
     share: np.ndarray  # [N] of the weight that is shown, that on the object
     photos: list[tuple[Camera, np.ndarray]]  # and where photos show what is beside the object, [H, W] bool
 
@@ -99,7 +99,7 @@ def shown_beside(
     both = ((goes & may) | stays) & told & some & ~mostly
     photos = [(s.camera, beside) for s, beside in zip(sights, clear)]
     found = may & told & ~some
-    return Shown(found, stays & told & mostly, both, found & (on_object + alike > LEAST * shown), share, photos)
+    return Shown(found, stays & told & mostly, both, (found | both) & (alike > LEAST * elsewhere), share, photos)
 
 
 def _window(polygon: np.ndarray) -> Window:

@@ -171,7 +171,7 @@ def test_the_next_cut_goes_on_from_the_colours_of_the_last(monkeypatch: pytest.M
 
 def test_what_may_be_a_foot_is_told_of_what_is_shown_beside_the_object() -> None:
     shown = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
-    assert not shown.alike[~shown.beside].any() and shown.alike[OUTER].mean() < 0.1
+    assert not shown.alike[~(shown.beside | shown.both)].any() and shown.alike[OUTER].mean() < 0.1
     stained = replace(SCENE, sh=SCENE.sh.copy())
     spot = OUTER & (np.random.default_rng(0).uniform(size=len(SCENE)) < 0.1)
     stained.sh[spot] = SCENE.sh[OBJECT].mean(0)
