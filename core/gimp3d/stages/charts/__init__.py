@@ -41,7 +41,7 @@ VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is the
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
-SPECK = 4  # texels; smaller parts of a hole are none
+SPECK = 4  # texels, of a part of a hole that is none
 MIXED = 2  # texels round the object whose pixels show some of it
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
@@ -196,7 +196,8 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Ch
 def _compact(hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[H, W] bool each: the hole without specks, and specks: where photos err, as what they show hangs together."""
     _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    large = hole & (parts[labels, cv2.CC_STAT_AREA] > SPECK)
+    size = np.where(hole, parts[labels, cv2.CC_STAT_AREA], 0)
+    large = hole & (size >= min(SPECK + 1, size.max()))  # of a thin rod the largest part may be one
     return large, hole & ~large
 
 
