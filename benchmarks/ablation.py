@@ -130,7 +130,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "colours do not tell the object from what is beside it": (
         (
             "gimp3d.steps.behind:shown_beside",
-            lambda scene, *_: Shown(*np.zeros((3, len(scene)), bool), np.zeros(len(scene)), []),
+            lambda scene, *_: Shown(*np.zeros((4, len(scene)), bool), np.zeros(len(scene)), []),
         ),
     ),
     "Gaussians that are both are taken or left whole": (

@@ -7,15 +7,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scenes import cameras, floor
 
 from benchmarks.ablation import RULES, Around, changed, switched_off
 from benchmarks.command import kept
 from gimp3d.errors import BadInput
 from gimp3d.pipeline import PRESETS
 from gimp3d.stages import light_search
+from gimp3d.stages.beside import Shown, Sight
+from gimp3d.steps import behind
 
 ROOT = Path(__file__).resolve().parents[2]
+CAMERA = cameras(1, 60, 45)[0]
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -23,6 +28,16 @@ def test_every_rule_names_something_that_is_there(rule: str) -> None:
     assert changed(PRESETS["balanced"], RULES[rule]) is not None
     with switched_off(RULES[rule]):
         pass
+
+
+@pytest.mark.parametrize("rule", [r for r, switches in RULES.items() if any("shown_beside" in s[0] for s in switches)])
+def test_what_photos_show_beside_the_object_can_be_told_otherwise(rule: str) -> None:
+    ground = floor(with_hole=False)
+    none = np.zeros(len(ground), bool)
+    sight = Sight(CAMERA, np.zeros((45, 60, 3), np.uint8), np.ones((45, 60), bool), np.zeros((45, 60), bool))
+    with switched_off(RULES[rule]):
+        told = behind.shown_beside(ground, ~none, none, ~none, [sight])
+    assert isinstance(told, Shown) and told.alike.shape == told.share.shape == none.shape
 
 
 def test_a_constant_and_a_function_come_back_after_an_error() -> None:

@@ -70,6 +70,8 @@ class Drawing:
 
     def footprints(self, *chosen: np.ndarray) -> tuple[np.ndarray, ...]:
         """Those of up to three sets, at the cost of one."""
+        if not 1 <= len(chosen) <= 3:
+            raise ValueError(f"chosen: expected one to three sets, got {len(chosen)}")
         for one in chosen:
             if one.shape != (len(self.gaussians),):
                 raise ValueError(f"chosen: expected shape {(len(self.gaussians),)}, got {one.shape}")

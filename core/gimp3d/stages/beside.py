@@ -23,7 +23,7 @@ from .witness import total_over
 ROUNDS = 1, 2  # times a photo's size at which it is cut, from what the round before found in all; larger cuts lose less
 MOSTLY = 0.5  # share of blend weight in a pixel that decides: the majority
 PURE = 0.7  # share from which a pixel has nobody else's colour
-LEAST = 0.1  # share of a Gaussian's weight in a photo from which on it shows it as the object's, or in its colours, too
+LEAST = 0.1  # share of a Gaussian's weight, shown as the object's or in its colours, from which on it may be its, too
 SOME = 0.25  # share from which the next round begins with it as the object's
 MARGIN = 12  # px round the boxes whose colours are the surroundings' for certain
 LEAST_VARIANCE = 1e-3  # squared grey levels, added to what a mixture's colours vary by: one may be even

@@ -64,6 +64,9 @@ def test_up_to_three_footprints_at_once() -> None:
             np.testing.assert_array_equal(found, footprint(gaussians, WIDE, chosen))
     with pytest.raises(ValueError, match="expected shape"):
         drawing(gaussians, WIDE, with_colour=False).footprints(sets[0], sets[1, :-1])
+    for count in (0, 4):
+        with pytest.raises(ValueError, match="one to three"):
+            drawing(gaussians, WIDE, with_colour=False).footprints(*[sets[0]] * count)
 
 
 def test_one_way_of_drawing_does_not_disturb_the_others() -> None:
