@@ -138,6 +138,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "what was left is not asked": (("gimp3d.steps.behind:LEFT", ()),),
     "photos do not tell each other": (("gimp3d.stages.beside:ROUNDS", (2,)),),
+    "what a cut takes off may lie apart from what it began from": (
+        ("gimp3d.stages.beside:_begun", lambda cut, _: cut),
+    ),
     "photos are cut at their own size": (("gimp3d.stages.beside:ROUNDS", (1, 1)),),
     "what photos show beside the object may be a foot, whatever its colours": (
         ("gimp3d.steps.behind:shown_beside", Around(_all_alike)),

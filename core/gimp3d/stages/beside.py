@@ -79,7 +79,7 @@ def shown_beside(
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)
         labels = np.full(sight.polygon.shape, ELSE, np.uint8)
-        cut = _cut(sight.photo[window], start[window], size, mixtures[k])
+        cut = _begun(_cut(sight.photo[window], start[window], size, mixtures[k]), start[window])
         if size == ROUNDS[-1]:
             labels[window][_alike(sight.photo[window], mixtures[k]) & sight.polygon[window]] = ALIKE
         labels[window][cut] = OBJECT
@@ -123,6 +123,12 @@ def _cut(photo: np.ndarray, start: np.ndarray, times: float, mixtures: np.ndarra
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR)
         cv2.grabCut(small, labels, None, mixtures[0], mixtures[1], 1, mode)
     return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _begun(cut: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the parts of a cut that hold some of what it began from; others only have the object's colours."""
+    _, parts = cv2.connectedComponents(cut.astype(np.uint8), connectivity=8)
+    return cut & np.isin(parts, parts[cut & (start & 1 > 0)])
 
 
 def _alike(photo: np.ndarray, mixtures: np.ndarray) -> np.ndarray:

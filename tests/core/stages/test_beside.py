@@ -11,6 +11,7 @@ import pytest
 from scenes import BLOCK, REGION, block, cameras, discs, floor
 
 from gimp3d.gaussians import Gaussians
+from gimp3d.geometry import dilated
 from gimp3d.raster import footprint, render_bytes
 from gimp3d.stages import beside
 from gimp3d.stages.beside import Sight, shown_beside
@@ -167,6 +168,18 @@ def test_the_next_cut_goes_on_from_the_colours_of_the_last(monkeypatch: pytest.M
     mixtures = np.zeros((2, 1, 65))
     once, more = (beside._cut(first.photo, start, 1, mixtures) for _ in range(2))
     assert (once ^ more).mean() < 0.01 < once.mean()
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_what_has_the_objects_colours_and_lies_apart_from_it_stays(apart: bool) -> None:
+    """A dark spot on the floor of the box is no piece of a dark object; the same spot at its foot may be."""
+    away = SCENE.means[:, :2] - [BLOCK / 2 + (0.11 if apart else 0.02), 0]
+    spot = RING & (np.abs(away).max(1) < 0.04)
+    painted = replace(SCENE, sh=SCENE.sh.copy())
+    painted.sh[spot] = SCENE.sh[OBJECT].mean(0)
+    wide = [s._replace(polygon=dilated(s.polygon, 20)) for s in sights(painted)]
+    shown = shown_beside(painted, OBJECT, RING, MAY, wide)
+    assert spot.sum() >= 4 and shown.object_[spot].mean() == (0 if apart else 1)
 
 
 def test_what_may_be_a_foot_is_told_of_what_is_shown_beside_the_object() -> None:
