@@ -54,7 +54,7 @@ def _by_depth_alone(witness: Any, _: Any, hits: Any) -> np.ndarray:
 def _all_alike(shown_beside: Any) -> Any:
     def shown(*of: Any) -> Any:
         found = shown_beside(*of)
-        return found._replace(alike=found.beside | found.both)
+        return found._replace(alike=found.beside)
 
     return shown
 
@@ -82,10 +82,6 @@ def _led_nowhere(parted: Callable[..., list[Chart]]) -> Callable[..., list[Chart
 
 def _little_known(beyond: np.ndarray) -> bool:
     return min(beyond[rows, ..., 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
-
-
-def _none_alike(shown: Shown) -> Shown:
-    return shown._replace(alike=np.zeros_like(shown.alike))
 
 
 def _none_both(shown: Shown) -> Shown:
@@ -148,7 +144,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "a twentieth of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.05),),
     "a quarter of a Gaussian may be shown as the object": (("gimp3d.stages.beside:LEAST", 0.25),),
     "charts take colours where a foot may be": (
-        ("gimp3d.steps.behind:shown_beside", Around(lambda shown: lambda *p: _none_alike(shown(*p)))),
+        ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
     "a texel that no photo shows is a hole": (("gimp3d.stages.charts:SPECK", 0),),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),

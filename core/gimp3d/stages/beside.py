@@ -23,7 +23,7 @@ from .witness import total_over
 ROUNDS = 1, 2  # times a photo's size at which it is cut, from what the round before found in all; larger cuts lose less
 MOSTLY = 0.5  # share of blend weight in a pixel that decides: the majority
 PURE = 0.7  # share from which a pixel has nobody else's colour
-LEAST = 0.1  # share of a Gaussian's weight, shown as the object's or in its colours, from which on it may be its, too
+LEAST = 0.1  # share of a Gaussian's weight that photos must show as the object's for it to be the object's, too
 SOME = 0.25  # share from which the next round begins with it as the object's
 MARGIN = 12  # px round the boxes whose colours are the surroundings' for certain
 LEAST_VARIANCE = 1e-3  # squared grey levels, added to what a mixture's colours vary by: one may be even
@@ -46,7 +46,7 @@ class Shown(NamedTuple):
     beside: np.ndarray  # beside the object, of those that may be surroundings
     object_: np.ndarray  # as the object, of those in the boxes that yet would be left
     both: np.ndarray  # of both: more beside the object than not, yet some of it
-    alike: np.ndarray  # of what is beside or both: beside the object in colours that are rather its: it may be a foot
+    alike: np.ndarray  # beside the object, yet some of it in colours that are rather the object's: it may be a foot
     share: np.ndarray  # [N] of the weight that is shown, that on the object
     photos: list[tuple[Camera, np.ndarray]]  # and where photos show what is beside the object, [H, W] bool
 
@@ -58,14 +58,14 @@ def shown_beside(
     boxes; all [N] bool.
 
     Each photo is cut by its colours into the object and the rest (GrabCut, Rother et al. 2004): of what `goes`, as it
-    is drawn there, what may be nothing else is the object's for certain. Once more, larger and with the colours found,
-    from what in the boxes all photos show as the object's to some share: so they tell each other. What a cut takes off
-    hangs together; of thin feet that stand on what looks much like them single pixels tell.
+    is drawn there, what may be nothing else is the object's for certain. Once more, larger, from what in the boxes all
+    photos show as the object's to some share: so they tell each other. What a cut takes off hangs together; of thin
+    feet that stand on what looks much like them single pixels tell.
     """
     begins, sure, in_boxes = goes, goes & ~may, goes | stays
     sights = [sight for sight in sights if sight.polygon.any()]
     elsewhere, on_object = np.zeros((2, len(scene)))
-    clear, mixtures = [s.polygon for s in sights], np.zeros((len(sights), 2, 1, 65))
+    clear = [s.polygon for s in sights]
 
     def of(size: float, k: int) -> np.ndarray:
         sight = sights[k]
@@ -79,10 +79,10 @@ def shown_beside(
         start[sight.marked] = cv2.GC_BGD
         window = _window(sight.polygon)
         labels = np.full(sight.polygon.shape, ELSE, np.uint8)
-        cut = _begun(_cut(sight.photo[window], start[window], size, mixtures[k]), start[window])
+        cut, mixtures = _cut(sight.photo[window], start[window], size)
         if size == ROUNDS[-1]:
-            labels[window][_alike(sight.photo[window], mixtures[k]) & sight.polygon[window]] = ALIKE
-        labels[window][cut] = OBJECT
+            labels[window][_alike(sight.photo[window], mixtures) & sight.polygon[window]] = ALIKE
+        labels[window][_begun(cut, start[window])] = OBJECT
         labels[sight.marked] = OBJECT
         clear[k] = labels != OBJECT
         return label_weights(scene, sight.camera, labels, ALIKE, in_boxes | may)
@@ -99,7 +99,7 @@ def shown_beside(
     both = ((goes & may) | stays) & told & some & ~mostly
     photos = [(s.camera, beside) for s, beside in zip(sights, clear)]
     found = may & told & ~some
-    return Shown(found, stays & told & mostly, both, (found | both) & (alike > LEAST * elsewhere), share, photos)
+    return Shown(found, stays & told & mostly, both, found & (on_object + alike > LEAST * shown), share, photos)
 
 
 def _window(polygon: np.ndarray) -> Window:
@@ -108,21 +108,17 @@ def _window(polygon: np.ndarray) -> Window:
     return slice(max(0, top - MARGIN), bottom + 1 + MARGIN), slice(max(0, left - MARGIN), right + 1 + MARGIN)
 
 
-def _cut(photo: np.ndarray, start: np.ndarray, times: float, mixtures: np.ndarray) -> np.ndarray:
-    """[h, w] bool: what is the object's by its colours and hangs together.
-
-    `start` as GrabCut names it; `mixtures` [2, 1, 65], its background's and foreground's, in and out: it goes on from
-    them, or begins with k-means where they are 0.
-    """
+def _cut(photo: np.ndarray, start: np.ndarray, times: float) -> tuple[np.ndarray, np.ndarray]:
+    """[h, w] bool: what is the object's by its colours and hangs together; and the mixtures of the rest's and of the
+    object's colours, [2, 65], 0 if one of them is empty. `start` as GrabCut names it."""
     times = min(times, LARGEST / max(start.shape))
     size = [max(1, round(n * times)) for n in start.shape[::-1]]
-    labels = cv2.resize(start, size, interpolation=cv2.INTER_NEAREST)
+    labels, mixtures = cv2.resize(start, size, interpolation=cv2.INTER_NEAREST), np.zeros((2, 1, 65))
     if len(np.unique(labels & 1)) == 2:
-        mode = cv2.GC_EVAL if mixtures.any() else cv2.GC_INIT_WITH_MASK
         cv2.setRNGSeed(0)  # of this thread: what k-means begins with
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR)
-        cv2.grabCut(small, labels, None, mixtures[0], mixtures[1], 1, mode)
-    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        cv2.grabCut(small, labels, None, mixtures[0], mixtures[1], 1, cv2.GC_INIT_WITH_MASK)
+    return cv2.resize(labels & 1, start.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0, mixtures[:, 0]
 
 
 def _begun(cut: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -133,7 +129,7 @@ def _begun(cut: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 def _alike(photo: np.ndarray, mixtures: np.ndarray) -> np.ndarray:
     """[h, w] bool: pixels whose colours are rather the object's."""
-    elsewhere, object_ = (_likelihood(photo, mixture[0]) for mixture in mixtures)
+    elsewhere, object_ = (_likelihood(photo, mixture) for mixture in mixtures)
     return object_ > elsewhere
 
 

@@ -62,13 +62,16 @@ def pixels_of(weight: np.ndarray, settings: ClearingSettings) -> tuple[np.ndarra
     return shown, some
 
 
-def over_surfaces(scene: Gaussians, region: Region, laid: Sequence[Laid]) -> np.ndarray:
-    """[N] bool: what lies low over a surface, or as little below it."""
-    low, means = np.zeros(len(scene), bool), scene.means.astype(np.float64)
+def over_surfaces(scene: Gaussians, region: Region, laid: Sequence[Laid]) -> tuple[np.ndarray, np.ndarray]:
+    """What lies low over a surface or as little below it, and what lies below one; [N] bool each."""
+    low, sunk = np.zeros((2, len(scene)), bool)
+    means = scene.means.astype(np.float64)
     for one in laid:
         index, *at, z = framed(one.camera, means)
-        low[index] |= np.abs(one.depth[tuple(at)] - z) < LOW * extent(region)
-    return low
+        above = one.depth[tuple(at)] - z
+        low[index] |= np.abs(above) < LOW * extent(region)
+        sunk[index] |= above < 0
+    return low, sunk
 
 
 def clear_air(

@@ -116,7 +116,7 @@ def _as_photos_show(
 ) -> Surfaces:
     """The same, but what photos show beside the object stays, what they show as it goes, and what is both is split."""
     scene, selection = found.scene, found.selection
-    low = over_surfaces(scene, region, found.laid)
+    low, sunk = over_surfaces(scene, region, found.laid)
     may = low & scene.usable & near_region(scene, region, 1.0) & ~np.isin(selection.fates, NAMED)
     if not may.any():
         return found
@@ -137,7 +137,7 @@ def _as_photos_show(
         scene = scene.with_rows(split, rest).extended(parts)
     more = np.zeros(len(split), bool)
     selection = Selection(np.append(fates, np.full(len(split), np.uint8(Fate.REMOVED_STRADDLING))))
-    wary = selection.removed | np.append(back & shown.alike, more)
+    wary = selection.removed | np.append(back & (shown.alike | (both & ~sunk)), more)
     objects, doubtful = object_pixels(scene, masks.views, settings.clearing, selection.removed, wary)
     reason = f"{found.reason}, {int((back & ~both).sum())} Gaussians are shown beside it and stay, {gone} as it and go"
     reason += f", {len(split)} are both and split"

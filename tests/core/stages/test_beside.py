@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -91,12 +90,12 @@ def test_what_most_photos_show_as_the_object_is_so_for_certain_in_the_next_cut(m
     first, certain, cuts = sights()[0], dict[float, int](), list[float]()
     window = beside._window(first.polygon)
 
-    def cut(photo: np.ndarray, start: np.ndarray, size: float, mixtures: np.ndarray) -> np.ndarray:
+    def cut(photo: np.ndarray, start: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
         wrong = np.array_equal(photo, first.photo[window])
         if wrong:
             certain[size] = int((start == cv2.GC_FGD).sum())
         cuts.append(size)
-        return np.full(start.shape, not wrong)
+        return np.full(start.shape, not wrong), np.zeros((2, 65))
 
     monkeypatch.setattr(beside, "_cut", cut)
     found = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights()).beside
@@ -145,29 +144,11 @@ def test_a_cut_has_no_thin_foot_and_yet_tells_that_pixels_look_like_it() -> None
     start = np.full(object_.shape, cv2.GC_BGD, np.uint8)
     start[20:100, 10:150] = cv2.GC_PR_BGD
     start[object_] = cv2.GC_FGD
-    mixtures = np.zeros((2, 1, 65))
-    cut = beside._cut(photo, start, 1, mixtures)
+    cut, mixtures = beside._cut(photo, start, 1)
     alike = beside._alike(photo, mixtures)
     assert cut[object_].all() and alike[object_].mean() > 0.9
     assert alike[line].mean() > 0.9 > cut[line].mean() + 0.4
     assert alike[~(object_ | line)].mean() < 0.05
-
-
-def test_the_next_cut_goes_on_from_the_colours_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without k-means; from the same start it finds the same."""
-    modes, grab, first = list[int](), cv2.grabCut, sights()[0]
-
-    def grab_cut(image: np.ndarray, labels: np.ndarray, box: None, *rest: Any) -> Any:
-        modes.append(rest[-1])
-        return grab(image, labels, box, *rest)
-
-    monkeypatch.setattr(cv2, "grabCut", grab_cut)
-    assert shown_beside(SCENE, OBJECT | RING, NONE, MAY, [first]).beside.any()
-    assert modes == [cv2.GC_INIT_WITH_MASK, cv2.GC_EVAL]
-    start = np.where(footprint(SCENE, first.camera, OBJECT) > 0.5, cv2.GC_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    mixtures = np.zeros((2, 1, 65))
-    once, more = (beside._cut(first.photo, start, 1, mixtures) for _ in range(2))
-    assert (once ^ more).mean() < 0.01 < once.mean()
 
 
 @pytest.mark.parametrize("apart", [True, False])
@@ -184,16 +165,12 @@ def test_what_has_the_objects_colours_and_lies_apart_from_it_stays(apart: bool) 
 
 def test_what_may_be_a_foot_is_told_of_what_is_shown_beside_the_object() -> None:
     shown = shown_beside(SCENE, OBJECT | RING, NONE, MAY, sights())
-    assert not shown.alike[~(shown.beside | shown.both)].any() and shown.alike[OUTER].mean() < 0.1
-    spots, others = [], []
-    for seed in range(4):
-        stained = replace(SCENE, sh=SCENE.sh.copy())
-        spot = OUTER & (np.random.default_rng(seed).uniform(size=len(SCENE)) < 0.1)
-        stained.sh[spot] = SCENE.sh[OBJECT].mean(0)
-        shown = shown_beside(stained, OBJECT | RING, NONE, MAY, sights(stained))
-        spots.append(shown.alike[spot & shown.beside].mean())
-        others.append(shown.alike[OUTER & ~spot].mean())
-    assert np.mean(spots) > 0.2 > 0.05 > np.mean(others)
+    assert not shown.alike[~shown.beside].any() and shown.alike[OUTER].mean() < 0.1
+    stained = replace(SCENE, sh=SCENE.sh.copy())
+    spot = OUTER & (np.random.default_rng(0).uniform(size=len(SCENE)) < 0.1)
+    stained.sh[spot] = SCENE.sh[OBJECT].mean(0)
+    shown = shown_beside(stained, OBJECT | RING, NONE, MAY, sights(stained))
+    assert shown.alike[spot & shown.beside].mean() > 0.25 > 0.1 > shown.alike[OUTER & ~spot].mean()
 
 
 @pytest.mark.parametrize("goes", [np.zeros(len(SCENE), bool), np.ones(len(SCENE), bool)])

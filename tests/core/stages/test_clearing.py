@@ -130,11 +130,12 @@ def test_what_photos_show_beside_the_object_is_no_haze() -> None:
     assert haze in cleared(given) and haze not in cleared(given, beside=[haze])
 
 
-def test_low_over_a_surface_or_below_it(plain: Removal) -> None:
+def test_low_over_a_surface_and_below_it(plain: Removal) -> None:
     places = [[OFF, 0, -0.02], [OFF, 0.1, 0.01], [OFF, 0, -0.3], [OFF, 0, 0.3], [0, 0, -0.02]]
     laid = lay_planes([Plane.make(np.zeros(3), UP, REGION)], plain.witnesses, REGION)
-    assert list(np.flatnonzero(over_surfaces(specks(places), REGION, laid))) == [0, 1, 4]
-    assert not over_surfaces(specks(places), REGION, ()).any()
+    low, sunk = over_surfaces(specks(places), REGION, laid)
+    assert list(np.flatnonzero(low)) == [0, 1, 4] and list(np.flatnonzero(sunk)) == [0, 2, 4]
+    assert not np.any(over_surfaces(specks(places), REGION, ()))
 
 
 def test_floor_that_selection_took_is_no_object_in_photos() -> None:
