@@ -233,13 +233,16 @@ def paint_views(
     progress: Progress,
 ) -> Propagation:
     """Every view with the completed reference in its hole."""
-    loaders = [partial(_to_paint, v, completed.charts, with_seeds) for v in views]
+    loaders = [partial(_to_paint, v, completed, with_seeds) for v in views]
     return propagate(completed, loaders, settings.propagate, progress, field)
 
 
-def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -> ViewToPaint:
-    """The view with the depth of its splats, new ones too; or with the charts', where its own is theirs or none."""
-    v = view.left
+def _to_paint(view: ViewState, completed: Completed, with_seeds: Gaussians) -> ViewToPaint:
+    """The view with the depth of its splats, new ones too; or with the charts', where its own is theirs or none.
+
+    What meets another chart than the completed one has no depth: where charts meet, z-tests take one for the other.
+    """
+    v, charts, number = view.left, completed.charts, chart_number(completed.camera.id)
     before, after = v.depth_before, np.zeros_like(v.depth_before)
     if charts:
         assert view.hits is not None
@@ -248,6 +251,8 @@ def _to_paint(view: ViewState, charts: Sequence[Chart], with_seeds: Gaussians) -
         behind = (after == 0) | (after > (1 - tolerance) * there)
         after = np.where(v.target & (there > 0) & behind, there, snapped(after, there, scatter))
         before = snapped(before, there, scatter)
+        if number is not None:
+            after = np.where((view.hits.chart >= 0) & (view.hits.chart != number - 1), 0, after)
     elif v.target.any():
         window = window_mask(near_hole(v.target), v.camera)
         after = surface_depth(with_seeds, v.camera, pixels=window)[0]

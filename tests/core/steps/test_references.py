@@ -21,6 +21,7 @@ from gimp3d.io.images import write_png
 from gimp3d.orbit import look_at
 from gimp3d.pipeline import PRESETS, RemovalResult, View, remove_object, render_bytes
 from gimp3d.raster import footprint, surface_depth, touched_window
+from gimp3d.stages.charts import first_hits
 from gimp3d.stages.masks import ViewMasks
 from gimp3d.stages.propagate import Reference, Rule
 from gimp3d.steps.references import MARGIN, Turn, carried_over, redrawn, still_open, turns_of
@@ -87,6 +88,20 @@ def test_the_picture_of_a_chart_is_of_that_chart_alone() -> None:
     shown = first.there & ~first.hole
     np.testing.assert_array_equal(wall.image[shown], first.image[shown])
     assert (wall.image[wall.hole].astype(int) @ [-1, 2, -1] > 120).mean() < 0.05  # hardly any green
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_chart_paints_nothing_of_another_one_that_it_meets(number: int) -> None:
+    """At the wall's foot, a z-test takes the floor for the wall."""
+    chart = cleared(None).charts[number - 1]
+    given = np.where(chart.hole[..., None], np.uint8((20, 200, 40)), chart.image)
+    painted = remove_object(*corner(), CORNER, PRESETS["draft"], f"chart:{number}", given)
+    for view in corner()[1]:
+        picture = painted.painted[view.camera.id]
+        met = first_hits(painted.charts, view.camera, np.ones(picture.shape[:2], bool)).chart
+        green = picture.astype(int) @ [-1, 2, -1] > 120
+        assert green[met == number - 1].sum() > 400
+        assert not green[(met >= 0) & (met != number - 1)].any()
 
 
 def test_a_file_that_fills_is_of_the_chart_that_is_named(tmp_path: Path) -> None:
