@@ -84,6 +84,13 @@ def _little_known(beyond: np.ndarray) -> bool:
     return min(beyond[rows, ..., 0].sum() for rows in (ABOVE, BELOW)) < 2 * LEAST
 
 
+def _no_chart(to_paint: Any) -> Any:
+    def paint(view: Any, completed: Any, scene: Any) -> Any:
+        return to_paint(view, replace(completed, camera=replace(completed.camera, id="")), scene)
+
+    return paint
+
+
 def _none_both(shown: Shown) -> Shown:
     return shown._replace(both=np.zeros_like(shown.both))
 
@@ -146,7 +153,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "charts take colours where a foot may be": (
         ("gimp3d.steps.behind:over_surfaces", Around(lambda over: lambda *p: (over(*p)[0], np.ones(len(p[0]), bool)))),
     ),
-    "a texel that no photo shows is a hole": (("gimp3d.stages.charts:SPECK", 0),),
+    "a texel that no photo shows is a hole": (("gimp3d.stages.charts:specks", np.zeros_like),),
+    "a chart paints what z-tests take for it, though another one is met there": (
+        ("gimp3d.steps.references:_to_paint", Around(_no_chart)),
+    ),
     "colours of the object are pure": (("gimp3d.stages.charts:LEAST_SHARE", 1.0),),
     "textures may not be misplaced": (("gimp3d.stages.charts:MISPLACED", 0.0),),
     "what the object hides lies on planes": (

@@ -22,6 +22,7 @@ SOLID = 0.9  # opacity from which a pixel shows a surface and not a veil before 
 EVIDENCE_DEPTH = 0.006  # relative z within which a photo shows a completed surface: closer than SAME_DEPTH, as a copied
 # pixel of another surface is seen at once, while one that is not copied is only filled
 FAINT = 1e-3  # of a blur's weight, below which it shows next to nothing
+SPECK = 4  # px, of a part of a mask that is too small to be a thing of its own
 MOST_ROWS = 32_000  # of a picture that cv2.remap makes; it refuses 32,768
 
 
@@ -121,6 +122,12 @@ def cropped(camera: Camera, window: Window) -> Camera:
 def dilated(mask: np.ndarray, margin: int) -> np.ndarray:
     """[H, W] bool: a mask and all pixels within a square of `margin` pixels round its own."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1,) * 2, np.uint8)) > 0
+
+
+def specks(mask: np.ndarray) -> np.ndarray:
+    """[H, W] bool: the parts of a mask of a few pixels each."""
+    _, labels, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    return mask & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
 
 
 def blurred(picture: np.ndarray, shown: np.ndarray, sigma: float) -> np.ndarray:

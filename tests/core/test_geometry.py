@@ -22,6 +22,7 @@ from gimp3d.geometry import (
     pack_camera,
     project,
     sees,
+    specks,
     surface_normals,
     surface_points,
     unproject,
@@ -135,3 +136,12 @@ def test_a_blur_of_what_is_shown_is_the_normalised_convolution(channels: tuple[i
     np.testing.assert_allclose(found[30, 25], expected, rtol=5e-3)
     assert not found[5, 5].any()  # nothing is shown near
     np.testing.assert_allclose(blurred(np.ones_like(picture), shown, 1.5)[shown], 1, rtol=1e-5)
+
+
+def test_specks_are_parts_of_a_few_pixels() -> None:
+    mask = np.zeros((20, 30), bool)
+    mask[4:6, 4:6], mask[10, 10:15], mask[[14, 15], [20, 21]] = True, True, True
+    few = mask.copy()
+    few[10] = False
+    np.testing.assert_array_equal(specks(mask), few)
+    assert not specks(np.zeros((3, 3), bool)).any()

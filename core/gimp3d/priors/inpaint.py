@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from ..errors import BadInput, IllPosed
+from ..geometry import specks
 from ..io.images import read_image
 from ..solvers.exemplar import complete_picture
 from . import gemini, networks, servers
@@ -24,7 +25,6 @@ from .pasting import Appearance, interpolated, paste_picture, window_round_hole
 
 __all__ = ["PAINTERS", "PROVIDERS", "Appearance", "check_provider", "inpaint_reference", "painter", "paste_picture"]
 
-SPECK = 4  # px; smaller parts of a hole are interpolated
 PATCHES = (13, 21, 9)  # px, of variants in turn: larger ones continue larger figures, smaller ones fit closer
 CONFIDENCE_SCALE = 20.0  # grey levels of misfit at which the confidence has fallen to 1/e
 
@@ -92,10 +92,9 @@ def without_specks(
     provider: Provider, image: np.ndarray, hole: np.ndarray, seed: int, unknown: np.ndarray | None, variant: int
 ) -> Appearance:
     """Parts of the hole of a few pixels are interpolated; the provider fills the rest."""
-    _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    specks = hole & (parts[labels, cv2.CC_STAT_AREA] <= SPECK)
-    if specks.any():
-        image, hole = np.where(specks[..., None], interpolated(image, hole), image), hole & ~specks
+    few = specks(hole)
+    if few.any():
+        image, hole = np.where(few[..., None], interpolated(image, hole), image), hole & ~few
     if not hole.any():
         return Appearance(image, 1.0, "a hole of a few pixels: interpolated")
     return provider(image, hole, seed, unknown, variant)

@@ -722,13 +722,13 @@ def test_rests_are_what_photos_agree_on_and_specks_do_not_grow() -> None:
     assert rests[12:18, 37:44].sum() == 1
 
 
-@pytest.mark.parametrize("others", [0, 3])
-def test_the_largest_part_of_a_hole_is_none_of_its_specks(others: int) -> None:
-    hole = np.zeros((20, 30), bool)
-    hole[4:6, 4:6], hole[14, 3 : 3 + 6 * others : 6] = True, True
-    large, specks = stage._compact(hole)
-    assert large[4:6, 4:6].all() and large.sum() == 4 and specks.sum() == others
-    assert not any(a.any() for a in stage._compact(np.zeros((3, 3), bool)))
+def test_a_hole_that_is_no_larger_than_a_speck_is_one(
+    floor_room: Room, floor_chart: Chart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thin rod's."""
+    monkeypatch.setattr("gimp3d.geometry.SPECK", int(floor_chart.hole.sum()))
+    (chart,) = charts_of([Plane.make(np.zeros(3), UP, REGION)], floor_room.witnesses)
+    np.testing.assert_array_equal(chart.hole, floor_chart.hole)
 
 
 @pytest.mark.parametrize(("reach", "is_hole"), [(0, False), (5, True)])

@@ -16,7 +16,7 @@ import scipy.ndimage
 
 from ...box import Region, in_region
 from ...compute.threads import parallel_map
-from ...geometry import blurred, dilated, framed
+from ...geometry import blurred, dilated, framed, specks
 from ...solvers.kriging import carried
 from ..witness import Says, Textures, Witness, ask, mosaic
 from .find import MOST_SCATTER, TOLERANCE, ChartSettings, depth_scatter
@@ -41,7 +41,6 @@ VOTERS = 4.0  # px, σ of the neighbourhood that says whether the surface is the
 UNLIKE = 3.0  # times what photos of the surface differ by, from which they show different things
 MISPLACED = 0.4  # share of a texture that they have in common by which they may differ besides, and be copied from
 LEAST_SPREAD = 6.0  # grey levels of texture that photos may always differ by
-SPECK = 4  # texels, of a part of a hole that is none
 MIXED = 2  # texels round the object whose pixels show some of it
 GRAIN = 4.0  # grey levels, σ by which colours of one kind differ at least
 LEAST_SHARE = 0.3  # of the object in a colour that shows it: its edges are mixed with the surface
@@ -178,27 +177,22 @@ def _chart(laid: Laid, region: Region, witnesses: Sequence[Witness]) -> tuple[Ch
     colours = _object_colours(laid.plane, witnesses, tolerance)
     inside = in_region(region, points.reshape(-1, 3)).reshape(laid.depth.shape)
     rests, foreign = _told_by_colours(shown, colours, inside)
-    hole, specks = _compact(shown.hole | rests)
-    image = np.where(specks[..., None], blurred(shown.image, ~(hole | specks), 1.0), shown.image).astype(np.uint8)
+    hole = shown.hole | rests
+    erred = specks(hole)  # photos err: what they show hangs together
+    erred &= (hole & ~erred).any()  # all of it may be as small, of a thin rod
+    image = np.where(erred[..., None], blurred(shown.image, ~hole, 1.0), shown.image).astype(np.uint8)
+    hole &= ~erred
     chart = Chart(
         **vars(laid),
         there=shown.there,
         image=np.where(hole[..., None], np.uint8(0), image),
-        known=shown.known & ~hole & ~specks & ~foreign,
+        known=shown.known & ~hole & ~erred & ~foreign,
         hole=hole,
         photos=shown.photos,
         scatter=scatter,
         tolerance=tolerance,
     )
     return chart, shown.spread
-
-
-def _compact(hole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W] bool each: the hole without specks, and specks: where photos err, as what they show hangs together."""
-    _, labels, parts, _ = cv2.connectedComponentsWithStats(hole.astype(np.uint8), connectivity=8)
-    size = np.where(hole, parts[labels, cv2.CC_STAT_AREA], 0)
-    large = hole & (size >= min(SPECK + 1, size.max()))  # of a thin rod the largest part may be one
-    return large, hole & ~large
 
 
 def _placed(
