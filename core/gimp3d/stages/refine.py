@@ -27,6 +27,7 @@ SSIM = 0.2  # share of D-SSIM in the loss, the rest is L1 (Kerbl 2023)
 MARGIN = 4  # px of known picture round the target that counts as well: no visible seam
 PAINTED = 0.5  # how far a painted pixel is believed, beside one of a photo
 HELD_OUT = 8  # every so many views is not learned from; it says when to stop
+TOGETHER = 2  # views whose gradients are taken from the same state, side by side; each moves it one step
 BETAS, EPSILON = (0.9, 0.999), 1e-15  # of Adam
 # Its learning rates: 3DGS's, those of shapes lower as there are few steps; of means in the Gaussians' median size.
 RATES = {"means": 0.02, "log_scales": 0.005, "quats": 0.001, "opacity_logits": 0.02}
@@ -106,11 +107,14 @@ def refine_gaussians(
         return float(np.mean(parallel_map(lambda v: v.loss(state.gaussians), judges)))
 
     before = best = judged()
-    kept, kept_step, waited, order = new, 0, 0, list[int]()
-    for step in range(1, settings.steps + 1):
-        if not order:
-            order = list(rng.permutation(len(learners)))
-        state.step(learners[order.pop()].slopes(state.gaussians))
+    kept, kept_step, waited, step, order = new, 0, 0, 0, list[int]()
+    while step < settings.steps:
+        order = order or list(rng.permutation(len(learners)))
+        count = min(TOGETHER, settings.check - step % settings.check, settings.steps - step)
+        looks, order = order[:count], order[count:]
+        for slopes in parallel_map(lambda k: learners[k].slopes(state.gaussians), looks):
+            state.step(slopes)
+        step += len(looks)
         if step % settings.check == 0 or step == settings.steps:
             now = judged()
             progress("refine", step, settings.steps, f"held-out loss {now:.4f}")
