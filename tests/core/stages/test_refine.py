@@ -81,6 +81,28 @@ def test_the_result_does_not_depend_on_threads_or_the_run(
         assert getattr(found[0], name).tobytes() == getattr(found[1], name).tobytes()
 
 
+def test_every_view_teaches_once_before_one_does_again(
+    task: tuple[Gaussians, Gaussians, list[Observation]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, seeds, observations = task
+    taught, looked = list[tuple[int, bytes]](), list[int]()
+    slopes = refine._View.slopes
+
+    def noted(view: refine._View, active: Gaussians) -> Gradients:
+        taught.append((id(view), active.means.tobytes()))
+        return slopes(view, active)
+
+    monkeypatch.setattr(refine._View, "slopes", noted)
+    refine_gaussians(
+        known, seeds, observations, RefineSettings(21, check=7, patience=9), progress=lambda _, n, *__: looked.append(n)
+    )
+    views, states = zip(*taught)
+    learners = len(set(views))
+    assert learners == 8 and len(views) == 21 and looked == [7, 14, 21]
+    assert len(set(views[:8])) == len(set(views[8:16])) == 8
+    assert len(set(states)) == 12  # two views from each, but before a look or a new round
+
+
 def test_held_out_views_keep_the_start_where_every_step_harms(
     task: tuple[Gaussians, Gaussians, list[Observation]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
