@@ -242,7 +242,8 @@ def _to_paint(view: ViewState, completed: Completed, with_seeds: Gaussians) -> V
 
     What meets another chart than the completed one has no depth: where charts meet, z-tests take one for the other.
     """
-    v, charts, number = view.left, completed.charts, chart_number(completed.camera.id)
+    v, charts = view.left, completed.charts
+    number = chart_number(completed.camera.id) if completed.camera.split == CHART else None
     before, after = v.depth_before, np.zeros_like(v.depth_before)
     if charts:
         assert view.hits is not None
